@@ -1,0 +1,25 @@
+"""manicm_ms: one-step 3D manipulation policies and the parallel simulation to judge them in.
+
+Importing this package loads no simulator; `make_vec` does, on first use.
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
+
+__version__ = "0.1.0"
+__all__ = ["__version__", "check_vec_env", "make_vec"]
+
+if TYPE_CHECKING:
+    from manicm_ms.envs.conformance import check_vec_env
+    from manicm_ms.envs.vec_env import make_vec
+
+_LAZY = {"make_vec": "manicm_ms.envs.vec_env", "check_vec_env": "manicm_ms.envs.conformance"}
+
+
+def __getattr__(name: str) -> Any:
+    if name not in _LAZY:
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    import importlib
+
+    return getattr(importlib.import_module(_LAZY[name]), name)

@@ -1,0 +1,1 @@
+"""Expert demonstrations: collecting, storing, slicing into windows, inspecting."""

@@ -1,0 +1,1 @@
+"""Parallel environments behind one vector interface."""

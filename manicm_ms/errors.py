@@ -1,0 +1,68 @@
+"""Errors that show the way out: what was asked, what exists, and what to try.
+
+Every error that a user can cause derives from `ManicmError`; the command line prints its one line
+and ends with exit status 2, without a traceback.
+"""
+
+from __future__ import annotations
+
+import difflib
+from collections.abc import Iterable
+
+
+class ManicmError(Exception):
+    """Base of all errors caused by input or surroundings rather than by a defect of the package."""
+
+
+class UnknownNameError(ManicmError):
+    """A name that no registry entry answers to."""
+
+    def __init__(self, kind: str, asked: str, known: Iterable[str]) -> None:
+        names = sorted(known)
+        near = difflib.get_close_matches(asked, names, n=1, cutoff=0.4)
+        hint = f"did you mean {near[0]!r}? " if near else ""
+        super().__init__(f"unknown {kind} {asked!r}: {hint}known: {', '.join(names) or 'none'}")
+        self.kind, self.asked, self.known = kind, asked, names
+
+
+class DuplicateNameError(ManicmError):
+    """Two registrations under one name."""
+
+    def __init__(self, kind: str, name: str) -> None:
+        super().__init__(f"{kind} {name!r} is registered twice: give one of the two another name")
+
+
+class ConfigError(ManicmError):
+    """A configuration whose fields do not fit together or are out of range."""
+
+
+class ActionError(ManicmError):
+    """An action that has the wrong shape or is not finite."""
+
+
+class SpecMismatchError(ManicmError):
+    """A data set, checkpoint or environment whose specs do not fit each other."""
+
+
+class StoreError(ManicmError):
+    """A demonstration store that is missing, broken, locked or of another origin."""
+
+
+class CheckpointError(ManicmError):
+    """A checkpoint folder that is missing, incomplete, altered or foreign."""
+
+
+class OutputExistsError(ManicmError):
+    """An output folder that already holds another run."""
+
+
+class NoSpaceError(ManicmError):
+    """Too little free space to write what is about to be written."""
+
+
+class RenderDeviceError(ManicmError):
+    """No Vulkan device that SAPIEN can render with."""
+
+
+class BackendError(ManicmError):
+    """A simulation backend that this machine cannot run."""

@@ -1,0 +1,1 @@
+"""Judging policies: roll-outs, latency, statistics, reports."""

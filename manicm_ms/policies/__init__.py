@@ -1,0 +1,1 @@
+"""Policies: point clouds in, action chunks out. Knows no simulator."""

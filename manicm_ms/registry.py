@@ -1,0 +1,68 @@
+"""Register once, discover everywhere: named entries with tags, duplicates refused, near misses suggested."""
+
+from __future__ import annotations
+
+import importlib
+import pkgutil
+from collections.abc import Callable, Iterable
+from typing import Any, Generic, TypeVar
+
+from manicm_ms.errors import DuplicateNameError, UnknownNameError
+
+T = TypeVar("T")
+
+
+class Registry(Generic[T]):
+    """Maps names to entries of one kind (environments, policies, presets, ...).
+
+    Args:
+        kind: what an entry is called in an error message, for example "env id".
+        package: dotted name of a package whose modules are imported once, before the first look-up,
+            so that their decorators run; None where all entries are registered by their importer.
+    """
+
+    def __init__(self, kind: str, package: str | None = None) -> None:
+        self.kind = kind
+        self._package = package
+        self._entries: dict[str, T] = {}
+        self._tags: dict[str, frozenset[str]] = {}
+
+    def add(self, name: str, entry: T, tags: Iterable[str] = ()) -> T:
+        """Enter `entry` under `name`; raise DuplicateNameError where the name is taken."""
+        if name in self._entries:
+            raise DuplicateNameError(self.kind, name)
+        self._entries[name] = entry
+        self._tags[name] = frozenset(tags)
+        return entry
+
+    def register(self, name: str, tags: Iterable[str] = ()) -> Callable[[Any], Any]:
+        """Return a decorator that enters what it decorates under `name`."""
+
+        def decorate(entry: Any) -> Any:
+            return self.add(name, entry, tags)
+
+        return decorate
+
+    def get(self, name: str) -> T:
+        """Return the entry called `name`; raise UnknownNameError with the nearest known name."""
+        self._discover()
+        if name not in self._entries:
+            raise UnknownNameError(self.kind, name, self._entries)
+        return self._entries[name]
+
+    def names(self, tag: str | None = None) -> tuple[str, ...]:
+        """Return the known names in order of registration, only those carrying `tag` if it is given."""
+        self._discover()
+        return tuple(n for n in self._entries if tag is None or tag in self._tags[n])
+
+    def tags(self, name: str) -> frozenset[str]:
+        """Return the tags of the entry called `name`."""
+        self.get(name)
+        return self._tags[name]
+
+    def _discover(self) -> None:
+        if self._package is None:
+            return
+        package, self._package = importlib.import_module(self._package), None
+        for module in pkgutil.iter_modules(package.__path__):
+            importlib.import_module(f"{package.__name__}.{module.name}")

@@ -1,0 +1,1 @@
+"""Robots as ManiSkill agents, one file each."""

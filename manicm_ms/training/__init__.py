@@ -1,0 +1,1 @@
+"""One training loop; objectives plug into it."""

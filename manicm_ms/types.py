@@ -1,0 +1,204 @@
+"""Shapes, units, frames and conventions as data: the words that all parts of the package share.
+
+Spelled once here, these specs travel with environments, demonstration stores and checkpoints, and are
+compared before work starts instead of being trusted.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass, field
+from typing import Any
+
+from manicm_ms.errors import ConfigError, SpecMismatchError
+
+POINT_CLOUD = "point_cloud"
+"""(P, 3) or (P, 6) float32: xyz in metres in `ObsSpec.frame`, then rgb in [0, 1]."""
+AGENT_POS = "agent_pos"
+"""(D,) float32: proprioception; `EnvSpec.agent_pos_names` says what each entry is, with its unit."""
+IMAGE = "image"
+"""(H, W, 3) uint8."""
+DEPTH = "depth"
+"""(H, W) float32, metres along the optical axis, 0 where nothing was hit."""
+STATE = "state"
+"""(S,) float32 privileged state, for experts and critics; `EnvSpec.state_layout` names its parts."""
+ACTION = "action"
+"""(Da,) float32, normalised to [-1, 1]."""
+
+OBS_KEYS = (POINT_CLOUD, AGENT_POS, IMAGE, DEPTH, STATE)
+
+FRAMES = ("robot_base", "world")
+
+
+@dataclass(frozen=True)
+class ChunkSpec:
+    """Which frames a policy reads, predicts and executes.
+
+    For To = 2, Tp = 4, Ta = 3 (time runs right, t is the present frame)::
+
+        frame       t-1   t   t+1  t+2
+        observed     x    x
+        predicted    x    x    x    x
+        executed          x    x    x
+
+    The first predicted action belongs to the oldest observed frame, so at most Tp - To + 1 of them
+    lie at or after the present. (The public DP3 code slices past the end and silently plays fewer.)
+
+    Attributes:
+        n_obs_steps: To, frames read, the present one last.
+        horizon: Tp, actions predicted.
+        n_action_steps: Ta, actions executed from the present frame on.
+    """
+
+    n_obs_steps: int = 2
+    horizon: int = 4
+    n_action_steps: int = 3
+
+    def __post_init__(self) -> None:
+        if min(self.n_obs_steps, self.horizon, self.n_action_steps) < 1:
+            raise ConfigError(f"n_obs_steps, horizon and n_action_steps must be at least 1, got {self}")
+        most = self.horizon - self.n_obs_steps + 1
+        if self.n_action_steps > most:
+            raise ConfigError(
+                f"n_action_steps={self.n_action_steps} exceeds horizon - n_obs_steps + 1 = {most}: "
+                f"execute at most {most} actions or raise horizon (now {self.horizon})"
+            )
+
+    @property
+    def executed(self) -> slice:
+        """Indices of the executed actions within the predicted horizon."""
+        return slice(self.n_obs_steps - 1, self.n_obs_steps - 1 + self.n_action_steps)
+
+
+@dataclass(frozen=True)
+class ObsSpec:
+    """What one frame of observation holds.
+
+    Attributes:
+        num_points: P, points of the cloud.
+        point_channels: 3 (xyz, metres) or 6 (xyz and rgb in [0, 1]).
+        agent_pos_dim: D.
+        frame: frame of the cloud, one of `FRAMES`.
+        image_size: (H, W) of `image` and `depth`, pixels.
+    """
+
+    num_points: int
+    point_channels: int
+    agent_pos_dim: int
+    frame: str
+    image_size: tuple[int, int] = (84, 84)
+
+    def __post_init__(self) -> None:
+        if self.frame not in FRAMES:
+            raise ConfigError(f"frame {self.frame!r} is not one of {', '.join(FRAMES)}")
+        if self.point_channels not in (3, 6):
+            raise ConfigError(f"point_channels must be 3 (xyz) or 6 (xyz, rgb), got {self.point_channels}")
+
+
+@dataclass(frozen=True)
+class ActionSpec:
+    """What an action means; entries are normalised to [-1, 1].
+
+    Attributes:
+        names: name of each entry, unit of its physical value in brackets.
+        control_mode: controller that receives it.
+        control_hz: actions per second.
+    """
+
+    names: tuple[str, ...]
+    control_mode: str
+    control_hz: float
+
+    @property
+    def dim(self) -> int:
+        """Da, entries of an action."""
+        return len(self.names)
+
+
+@dataclass(frozen=True)
+class EnvSpec:
+    """All that is fixed about an environment id.
+
+    Attributes:
+        env_id: for example "ur3e/slide-block".
+        obs: what a frame holds.
+        action: what an action means.
+        max_episode_steps: control steps after which an episode is truncated.
+        agent_pos_names: name and unit of each entry of `agent_pos`.
+        tcp_indices: where in `agent_pos` the tool centre point's x, y, z (metres, in `obs.frame`)
+            stand, or None where it is not known; needed by policies with `cloud_frame="tcp"`.
+        state_layout: name -> (start, stop) of each part of the privileged `state`.
+        success_rule: "any" (true at some step) or "last" (true at the last step).
+    """
+
+    env_id: str
+    obs: ObsSpec
+    action: ActionSpec
+    max_episode_steps: int
+    agent_pos_names: tuple[str, ...]
+    tcp_indices: tuple[int, int, int] | None = None
+    state_layout: Mapping[str, tuple[int, int]] = field(default_factory=dict)
+    success_rule: str = "any"
+
+    def __post_init__(self) -> None:
+        if len(self.agent_pos_names) != self.obs.agent_pos_dim:
+            raise ConfigError(
+                f"{self.env_id}: {len(self.agent_pos_names)} agent_pos_names for agent_pos_dim={self.obs.agent_pos_dim}"
+            )
+        if self.success_rule not in ("any", "last"):
+            raise ConfigError(f"{self.env_id}: success_rule {self.success_rule!r} is neither 'any' nor 'last'")
+
+    @property
+    def state_dim(self) -> int:
+        """S, entries of the privileged state."""
+        return max((stop for _, stop in self.state_layout.values()), default=0)
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return plain JSON values; `from_dict` is its inverse."""
+        return asdict(self)
+
+    @classmethod
+    def from_dict(cls, d: Mapping[str, Any]) -> EnvSpec:
+        """Build a spec from what `to_dict` returned (possibly after a JSON round trip)."""
+        d = dict(d)
+        obs = dict(d.pop("obs"))
+        obs["image_size"] = tuple(obs["image_size"])
+        action = dict(d.pop("action"))
+        action["names"] = tuple(action["names"])
+        tcp = d.pop("tcp_indices")
+        layout = {k: tuple(v) for k, v in d.pop("state_layout").items()}
+        return cls(
+            obs=ObsSpec(**obs),
+            action=ActionSpec(**action),
+            tcp_indices=None if tcp is None else tuple(tcp),
+            state_layout=layout,
+            agent_pos_names=tuple(d.pop("agent_pos_names")),
+            **d,
+        )
+
+
+# What a producer (environment, store) and a consumer (policy) must agree on.
+_COMPARED = ("obs.point_channels", "obs.agent_pos_dim", "obs.frame", "agent_pos_names", "action.names",
+             "action.control_mode", "action.control_hz", "tcp_indices")  # fmt: skip
+
+
+def _field(spec: EnvSpec, dotted: str) -> Any:
+    value: Any = spec
+    for part in dotted.split("."):
+        value = getattr(value, part)
+    return value
+
+
+def require_compatible(producer: EnvSpec, consumer: EnvSpec, producer_name: str, consumer_name: str) -> None:
+    """Raise SpecMismatchError unless data of `producer` means what `consumer` was made for.
+
+    The env ids may differ (a policy may be tried on a sibling task); shapes, names, frames, the
+    control mode and the rate may not. The number of points may differ: encoders pool over points.
+    """
+    for dotted in _COMPARED:
+        ours, theirs = _field(producer, dotted), _field(consumer, dotted)
+        if ours != theirs:
+            raise SpecMismatchError(
+                f"{producer_name} and {consumer_name} do not fit: {dotted} is {ours!r} in the first and "
+                f"{theirs!r} in the second; use data, checkpoint and environment of one task"
+            )

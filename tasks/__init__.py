@@ -1,0 +1,1 @@
+"""Tasks, one file each; importing a module registers its environments and expert."""
