@@ -46,6 +46,10 @@ class Registry(Generic[T]):
     def get(self, name: str) -> T:
         """Return the entry called `name`; raise UnknownNameError with the nearest known name."""
         self._discover()
+        return self.get_registered(name)
+
+    def get_registered(self, name: str) -> T:
+        """Return the entry called `name` among those registered so far, without importing anything else."""
         if name not in self._entries:
             raise UnknownNameError(self.kind, name, self._entries)
         return self._entries[name]

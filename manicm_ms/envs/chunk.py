@@ -1,0 +1,125 @@
+"""Episode logic over a simulator: histories, action chunks, time limits, frozen rows, crashed rows."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import torch
+from torch import Tensor
+
+from manicm_ms.envs.simulator import Simulator, StepResult
+from manicm_ms.types import ChunkSpec
+
+
+class ActionChunk:
+    """Plays action chunks in n rows and renders only the frames that a policy will read.
+
+    For To = 2, Ta = 3 one `step` does this (r: rendered)::
+
+        action      a0   a1   a2
+        frame     f0   f1   f2   f3
+        rendered            r    r
+
+    A row that ends inside a chunk stops there: its last frame is rendered, its other actions are not played, and
+    it stays as it is until it is reset. A row whose simulator raises has crashed: it is terminated without
+    success, with the reason in `errors`.
+
+    Args:
+        simulator: the n rows.
+        n_obs_steps: To, frames of history returned.
+        n_action_steps: Ta, actions of a chunk.
+    """
+
+    def __init__(self, simulator: Simulator, n_obs_steps: int = 1, n_action_steps: int = 1) -> None:
+        self.simulator = simulator
+        self.n_obs_steps, self.n_action_steps = n_obs_steps, n_action_steps
+        n, device = simulator.num_rows, simulator.device
+        self.terminated = torch.ones(n, dtype=torch.bool, device=device)  # nothing can be stepped before a reset
+        self.truncated = torch.zeros_like(self.terminated)
+        self.success_once = torch.zeros_like(self.terminated)
+        self.elapsed = torch.zeros(n, dtype=torch.int64, device=device)
+        self.clipped = torch.zeros_like(self.elapsed)
+        self.errors: list[str | None] = [None] * n
+        self._info: dict[str, Tensor] = {}
+        self._history: dict[str, Tensor] = {}
+
+    @classmethod
+    def from_spec(cls, simulator: Simulator, chunk: ChunkSpec | None) -> ActionChunk:
+        """Build for `chunk`, or for single frames and single actions where it is None."""
+        if chunk is None:
+            return cls(simulator)
+        return cls(simulator, chunk.n_obs_steps, chunk.n_action_steps)
+
+    def reset(self, rows: Tensor, seeds: Sequence[int]) -> tuple[dict[str, Tensor], dict[str, Tensor]]:
+        """Start new episodes in `rows` (k,) int64; return all rows' histories (n, To, ...) and info (n,)."""
+        self.simulator.reset(rows, seeds)
+        for flags in (self.terminated, self.truncated, self.success_once):
+            flags[rows] = False
+        for counts in (self.elapsed, self.clipped):
+            counts[rows] = 0
+        for row in rows.tolist():
+            self.errors[row] = None
+        for name, values in self._info.items():
+            self._info[name] = values.index_fill(0, rows, 0)
+        self._restart_history(self.simulator.observe(), rows)
+        return self._history, self.info()
+
+    def step(self, actions: Tensor) -> tuple[dict[str, Tensor], Tensor, dict[str, Tensor]]:
+        """Play actions (n, Ta, Da); return histories (n, To, ...), summed rewards (n,) and info (n,)."""
+        active = ~(self.terminated | self.truncated)
+        reward = torch.zeros(len(active), device=self.simulator.device)
+        for k in range(self.n_action_steps):
+            if not active.any():
+                break
+            action = actions[:, k]
+            self.clipped += (action.abs() > 1).sum(dim=1) * active
+            try:
+                result = self.simulator.step(action.clamp(-1, 1))
+                ended = self._account(result, active)
+                if k >= self.n_action_steps - self.n_obs_steps or ended.any():
+                    self._push(self.simulator.observe(), active)
+            except Exception as error:  # whatever the simulator raises ends these episodes, not the run
+                self._crash(active, error)
+                break
+            reward += torch.where(active, result.reward, 0.0)
+            active = active & ~ended
+        return self._history, reward, self.info()
+
+    def info(self) -> dict[str, Tensor]:
+        """Return per-row facts (n,): those of the task and success_once, elapsed_steps, clipped."""
+        own = {"success_once": self.success_once, "elapsed_steps": self.elapsed, "clipped": self.clipped}
+        task = self._info or {"success": torch.zeros_like(self.terminated)}
+        return {name: values.clone() for name, values in (task | own).items()}
+
+    def _account(self, result: StepResult, active: Tensor) -> Tensor:
+        """Take over what a step brought in the active rows; return which of them ended, (n,) bool."""
+        self.elapsed += active
+        self.terminated |= active & result.terminated
+        self.truncated |= active & ~self.terminated & (self.elapsed >= self.simulator.spec.max_episode_steps)
+        for name, values in result.info.items():
+            before = self._info.get(name, torch.zeros_like(values))
+            self._info[name] = torch.where(active, values, before)
+        self.success_once |= self._info["success"]
+        return active & (self.terminated | self.truncated)
+
+    def _crash(self, active: Tensor, error: Exception) -> None:
+        self.terminated |= active
+        self._info["success"] = self._info.get("success", torch.zeros_like(active)) & ~active
+        self.success_once &= ~active
+        for row in active.nonzero().flatten().tolist():
+            self.errors[row] = f"{type(error).__name__}: {error}"
+
+    def _restart_history(self, frame: dict[str, Tensor], rows: Tensor) -> None:
+        for key, values in frame.items():
+            repeated = values[:, None].expand(-1, self.n_obs_steps, *values.shape[1:])
+            if key not in self._history:
+                self._history[key] = repeated.clone()
+            history = self._history[key].clone()  # what was handed out before must not change under its reader
+            history[rows] = repeated[rows]
+            self._history[key] = history
+
+    def _push(self, frame: dict[str, Tensor], active: Tensor) -> None:
+        for key, values in frame.items():
+            old = self._history[key]
+            new = torch.cat([old[:, 1:], values[:, None]], dim=1)
+            self._history[key] = torch.where(active.view(-1, *[1] * values.dim()), new, old)

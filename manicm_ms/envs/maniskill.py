@@ -1,0 +1,143 @@
+"""Rows of a ManiSkill task as a `Simulator`: one row on a CPU, many on a GPU; native point clouds from the camera."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import gymnasium
+import numpy as np
+import torch
+from torch import Tensor
+
+from manicm_ms import vulkan
+
+vulkan.prepare()  # before SAPIEN is first imported
+
+import mani_skill.envs  # noqa: E402, F401  (registers ManiSkill's own ids)
+
+from manicm_ms.envs.cameras import CLOUD_POSITION, COLOR, MICROMETRE, cloud_shader  # noqa: E402
+from manicm_ms.envs.simulator import Simulator, SimulatorConfig, StepResult  # noqa: E402
+from manicm_ms.envs.ur3e_tabletop import UR3eTabletopEnv  # noqa: E402
+from manicm_ms.errors import RenderDeviceError  # noqa: E402
+from manicm_ms.point_cloud import inside, sample_cloud, sample_cloud_batch, transform  # noqa: E402
+from manicm_ms.types import AGENT_POS, DEPTH, IMAGE, POINT_CLOUD, STATE, EnvSpec  # noqa: E402
+
+VIDEO_SHADER = "default"
+_RENDERED = {POINT_CLOUD, IMAGE, DEPTH}
+
+
+class ManiSkillSimulator(Simulator):
+    """Rows of a registered UR3e task.
+
+    Args:
+        spec: the environment's spec, already specialised.
+        config: how to build it.
+        gym_id: the id that the task is registered under with ManiSkill, for example "UR3eSlideBlock-v1".
+
+    Raises:
+        RenderDeviceError: SAPIEN finds no Vulkan device.
+    """
+
+    def __init__(self, spec: EnvSpec, config: SimulatorConfig, gym_id: str) -> None:
+        self.spec, self.config, self.num_rows = spec, config, config.num_rows
+        self.env = _make(gym_id, spec, config)
+        self.device = self.env.device
+        self._camera = self.env._sensors["d435i"]
+        self._closed = False
+
+    def reset(self, rows: Tensor, seeds: Sequence[int]) -> None:
+        """See `Simulator.reset`."""
+        every = np.zeros(self.num_rows, dtype=np.int64)  # rows that are not reset never draw from their seed
+        every[rows.cpu().numpy()] = np.asarray(seeds, dtype=np.int64)
+        self.env.reset(seed=every.tolist(), options={"env_idx": rows.to(self.device)})
+
+    def step(self, actions: Tensor) -> StepResult:
+        """See `Simulator.step`."""
+        _, reward, terminated, _, info = self.env.step(actions)
+        facts = {name: value for name, value in info.items() if isinstance(value, Tensor) and value.dim() == 1}
+        facts.pop("elapsed_steps", None)  # the episode logic counts for itself
+        return StepResult(reward.float(), terminated, facts)
+
+    def observe(self) -> dict[str, Tensor]:
+        """See `Simulator.observe`. Raises FloatingPointError where the simulation left the finite numbers."""
+        frame: dict[str, Tensor] = {}
+        wanted = self.config.obs
+        if AGENT_POS in wanted:
+            frame[AGENT_POS] = self.env.agent_pos()
+        if STATE in wanted:
+            frame[STATE] = self.env.privileged_state()
+        for key, values in frame.items():
+            if not torch.isfinite(values).all():
+                raise FloatingPointError(f"{key} is not finite: the simulation diverged")
+        if _RENDERED.intersection(wanted):
+            frame |= self._render(wanted)
+        return frame
+
+    def _render(self, wanted: tuple[str, ...]) -> dict[str, Tensor]:
+        pictures = self._pictures(color=IMAGE in wanted or self.config.colors)
+        position = pictures[CLOUD_POSITION]  # (n, H, W, 4) int32
+        frame: dict[str, Tensor] = {}
+        if POINT_CLOUD in wanted:
+            frame[POINT_CLOUD] = self._cloud(position, pictures.get(COLOR))
+        if DEPTH in wanted:
+            frame[DEPTH] = -position[..., 2] * MICROMETRE
+        if IMAGE in wanted:
+            frame[IMAGE] = pictures[COLOR][..., :3]
+        return frame
+
+    def _pictures(self, color: bool) -> dict[str, Tensor]:
+        names = [CLOUD_POSITION, COLOR] if color else [CLOUD_POSITION]
+        self.env.scene.update_render(update_sensors=True, update_human_render_cameras=False)
+        self._camera.capture()
+        return dict(zip(names, self._camera.camera.get_picture(names), strict=True))
+
+    def _cloud(self, position: Tensor, color: Tensor | None) -> Tensor:
+        n = len(position)
+        xyz = position[..., :3].reshape(n, -1, 3) * MICROMETRE
+        hit = position[..., 3].reshape(n, -1) != 0  # the background carries segmentation id 0
+        T_world_camera = self._camera.camera.get_model_matrix()
+        T_base_world = self.env.agent.robot.pose.inv().to_transformation_matrix()
+        xyz = transform(xyz, (T_base_world @ T_world_camera).float())
+        valid = hit & inside(xyz, self.env.workspace)
+        points = xyz if color is None else torch.cat([xyz, color[..., :3].reshape(n, -1, 3) / 255.0], dim=-1)
+        if self.device.type != "cpu":
+            return sample_cloud_batch(points, valid, self.config.num_points)
+        clouds = [sample_cloud(p[v].numpy(), self.config.num_points) for p, v in zip(points, valid, strict=True)]
+        return torch.from_numpy(np.stack(clouds))
+
+    def render_video_frames(self) -> Tensor:
+        """See `Simulator.render_video_frames`."""
+        return self.env.render_rgb_array("wide")
+
+    def close(self) -> None:
+        """See `Simulator.close`."""
+        if not self._closed:
+            self._closed = True
+            self.env.close()
+
+
+def _make(gym_id: str, spec: EnvSpec, config: SimulatorConfig) -> UR3eTabletopEnv:
+    height, width = config.image_size
+    shader = cloud_shader()
+    options: dict[str, Any] = {
+        "num_envs": config.num_rows,
+        "obs_mode": "none",  # frames are rendered on demand, by `observe`
+        "reward_mode": config.reward_mode,
+        "control_mode": spec.action.control_mode,
+        "sim_backend": "physx_cpu" if config.device == "cpu" else "physx_cuda",
+        "render_backend": "sapien_cuda" if torch.cuda.is_available() else "sapien_cpu",
+        "sensor_configs": {"shader_config": shader, "width": width, "height": height},
+        # ManiSkill builds the video camera in any case: without video it shares the shader that is compiled already.
+        "human_render_camera_configs": {"shader_pack": VIDEO_SHADER} if config.video else {"shader_config": shader},
+        "render_mode": "rgb_array",
+    }
+    try:
+        env = gymnasium.make(gym_id, **options)
+    except RuntimeError as error:
+        if "rendering device" not in str(error):
+            raise
+        raise RenderDeviceError(
+            "SAPIEN found no Vulkan device to render with: run 'make setup' to install one, then 'manicm-ms doctor'"
+        ) from error
+    return env.unwrapped  # type: ignore[return-value]

@@ -1,0 +1,118 @@
+"""What every suite must offer: n rows of one task in one process, advanced and observed separately.
+
+Observation is apart from motion because rendering dominates the cost: the episode logic above asks for a frame only
+where a policy will read it.
+"""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+from manicm_ms.errors import ConfigError
+from manicm_ms.registry import Registry
+from manicm_ms.types import AGENT_POS, OBS_KEYS, POINT_CLOUD, EnvSpec
+
+
+class StepResult(NamedTuple):
+    """What one control step of n rows brought.
+
+    Attributes:
+        reward: (n,) float32.
+        terminated: (n,) bool, the task ended (success or failure), not the time.
+        info: name -> (n,) tensor; always the same names, "success" (bool) among them.
+    """
+
+    reward: Tensor
+    terminated: Tensor
+    info: dict[str, Tensor]
+
+
+@dataclass(frozen=True)
+class SimulatorConfig:
+    """How a simulator is asked to be built.
+
+    Attributes:
+        num_rows: n, rows simulated together in this process.
+        obs: observation keys that `observe` returns; nothing else is rendered.
+        num_points: P, points of a cloud.
+        colors: append rgb in [0, 1] to the cloud's xyz.
+        image_size: (H, W) of the camera, pixels.
+        video: make `render_video_frames` available (building takes some seconds longer).
+        reward_mode: "sparse", "normalized_dense", "dense" or "none".
+        device: "cpu", or the accelerator that simulates and renders.
+    """
+
+    num_rows: int = 1
+    obs: tuple[str, ...] = (POINT_CLOUD, AGENT_POS)
+    num_points: int = 512
+    colors: bool = False
+    image_size: tuple[int, int] = (84, 84)
+    video: bool = False
+    reward_mode: str = "sparse"
+    device: str = "cpu"
+
+    def __post_init__(self) -> None:
+        unknown = [key for key in self.obs if key not in OBS_KEYS]
+        if unknown or not self.obs:
+            raise ConfigError(f"unknown observation keys {unknown}: choose from {', '.join(OBS_KEYS)}")
+        if self.num_rows < 1 or self.num_points < 1 or min(self.image_size) < 1:
+            raise ConfigError(f"num_envs, num_points and image_size must be at least 1, got {self}")
+
+    def specialise(self, spec: EnvSpec) -> EnvSpec:
+        """Return `spec` with the cloud and image shapes that this configuration asks for."""
+        obs = replace(
+            spec.obs, num_points=self.num_points, point_channels=6 if self.colors else 3, image_size=self.image_size
+        )
+        return replace(spec, obs=obs)
+
+
+class Simulator(ABC):
+    """n rows of one task. Tensors live on `device`; rows never influence each other."""
+
+    spec: EnvSpec
+    device: torch.device
+    num_rows: int
+
+    @abstractmethod
+    def reset(self, rows: Tensor, seeds: Sequence[int]) -> None:
+        """Start new episodes in `rows` (k,) int64 with `seeds` (length k); leave the other rows untouched."""
+
+    @abstractmethod
+    def step(self, actions: Tensor) -> StepResult:
+        """Play one action (n, Da) in [-1, 1] in every row for one control period."""
+
+    @abstractmethod
+    def observe(self) -> dict[str, Tensor]:
+        """Return the present frame: each asked key (n, ...)."""
+
+    @abstractmethod
+    def render_video_frames(self) -> Tensor:
+        """Return what the wide camera sees, (n, H, W, 3) uint8."""
+
+    @abstractmethod
+    def close(self) -> None:
+        """Free renderers and physics; a second call does nothing."""
+
+
+@dataclass(frozen=True)
+class EnvEntry:
+    """A registered environment.
+
+    Attributes:
+        spec: what is fixed about it.
+        build: makes a simulator from the specialised spec and a configuration.
+        module: dotted name of the module whose import registers it; worker processes import that one only.
+    """
+
+    spec: EnvSpec
+    build: Callable[[EnvSpec, SimulatorConfig], Simulator]
+    module: str
+
+
+ENVS: Registry[EnvEntry] = Registry("env id", package="manicm_ms.tasks")

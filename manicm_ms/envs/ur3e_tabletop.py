@@ -1,0 +1,223 @@
+"""What all UR3e tasks share below their own file: table, robot, cameras, proprioception, privileged state."""
+
+from __future__ import annotations
+
+from abc import abstractmethod
+from typing import Any, ClassVar
+
+import numpy as np
+import sapien
+import torch
+from mani_skill.envs.sapien_env import BaseEnv
+from mani_skill.sensors.camera import CameraConfig
+from mani_skill.utils.building.actor_builder import ActorBuilder
+from mani_skill.utils.geometry.rotation_conversions import quaternion_to_matrix
+from mani_skill.utils.structs import Actor, Pose
+from mani_skill.utils.structs.types import SceneConfig, SimConfig
+from torch import Tensor
+
+from manicm_ms.envs.cameras import D435I, WIDE, FixedCamera
+from manicm_ms.point_cloud import Box
+from manicm_ms.robots.ur3e_ag95 import UR3eAG95
+from manicm_ms.types import ActionSpec, EnvSpec, ObsSpec
+
+CONTROL_HZ, SIM_HZ = 20, 200
+ACTION = ActionSpec(
+    names=("dx [m]", "dy [m]", "dz [m]", "drx [rad]", "dry [rad]", "drz [rad]", "opening [m]"),
+    control_mode="pd_ee_target_delta_pose",
+    control_hz=CONTROL_HZ,
+)
+AGENT_POS_NAMES = (
+    "tcp_x [m]", "tcp_y [m]", "tcp_z [m]",
+    "tcp_r11", "tcp_r21", "tcp_r31", "tcp_r12", "tcp_r22", "tcp_r32",
+    "opening [m]",
+)  # fmt: skip
+"""TCP position, first two columns of its rotation matrix (continuous, unlike angles), gripper opening."""
+
+TABLE_HALF_SIZE = (0.40, 0.50, 0.02)  # m
+TABLE_CENTRE = (0.25, 0.0, -0.02)  # m: the top is z = 0, the height of the robot's base
+TABLE_COLOR = (0.55, 0.47, 0.38, 1.0)
+SPAWN_CLEARANCE = 3e-4  # m above rest: nothing has to settle, nothing interpenetrates
+START_JOINT_NOISE = 0.02  # rad, uniform to either side
+
+_SHARED_STATE = {"tcp_pose": 7, "tcp_target_pose": 7, "opening": 1}
+
+
+def ur3e_spec(env_id: str, max_episode_steps: int, objects: tuple[str, ...]) -> EnvSpec:
+    """Return the spec of a UR3e task whose privileged state holds the poses of `objects`.
+
+    A pose is (x, y, z, qw, qx, qy, qz), metres, in the robot-base frame.
+    """
+    layout, start = {}, 0
+    for name, width in (_SHARED_STATE | {f"{name}_pose": 7 for name in objects}).items():
+        layout[name] = (start, start + width)
+        start += width
+    return EnvSpec(
+        env_id=env_id,
+        obs=ObsSpec(num_points=512, point_channels=3, agent_pos_dim=len(AGENT_POS_NAMES), frame="robot_base"),
+        action=ACTION,
+        max_episode_steps=max_episode_steps,
+        agent_pos_names=AGENT_POS_NAMES,
+        tcp_indices=(0, 1, 2),
+        state_layout=layout,
+        success_rule="any",
+    )
+
+
+class UR3eTabletopEnv(BaseEnv):
+    """A UR3e with an AG-95 on a table. The base stands at the origin of each row's world: world frame = base frame.
+
+    A task defines `_load_objects`, `_place_objects`, `evaluate` and `reward_terms`, and the class attributes below.
+    """
+
+    SUPPORTED_ROBOTS: ClassVar[list[str]] = ["ur3e_ag95"]
+    SUPPORTED_REWARD_MODES: ClassVar[tuple[str, ...]] = ("normalized_dense", "dense", "sparse", "none")
+    agent: UR3eAG95
+
+    camera: ClassVar[FixedCamera] = D435I
+    workspace: ClassVar[Box] = Box((0.15, -0.25, 0.003), (0.50, 0.25, 0.15))
+    """Crop of the cloud. Objects never rise above 0.15 m; cutting there keeps the arm from taking their points."""
+    start_qpos: ClassVar[tuple[float, ...]]
+    """Arm joints at the start of an episode, rad."""
+    start_opening: ClassVar[float]
+    """Gripper opening at the start, m."""
+    table_friction: ClassVar[float] = 0.6
+    reward_weights: ClassVar[dict[str, float]]
+    """Weight of each named reward term; `reward_terms` returns the terms, each in [0, 1]."""
+
+    def __init__(self, *args: Any, robot_uids: str = "ur3e_ag95", **kwargs: Any) -> None:
+        self.objects: dict[str, Actor] = {}
+        super().__init__(*args, robot_uids=robot_uids, **kwargs)
+
+    @property
+    def _default_sim_config(self) -> SimConfig:
+        return SimConfig(
+            sim_freq=SIM_HZ,
+            control_freq=CONTROL_HZ,
+            scene_config=SceneConfig(contact_offset=0.005, solver_position_iterations=15, solver_velocity_iterations=1),
+        )
+
+    @property
+    def _default_sensor_configs(self) -> list[CameraConfig]:
+        return [_camera_config("d435i", self.camera)]
+
+    @property
+    def _default_human_render_camera_configs(self) -> list[CameraConfig]:
+        return [_camera_config("wide", WIDE)]
+
+    # ---- scene ------------------------------------------------------------------------------------------------
+
+    @abstractmethod
+    def _load_objects(self) -> dict[str, Actor]:
+        """Build the task's objects; return them by name, in the order of the privileged state."""
+
+    def _load_agent(self, options: dict[str, Any]) -> None:  # type: ignore[override]
+        super()._load_agent(options, sapien.Pose())
+
+    def _load_scene(self, options: dict[str, Any]) -> None:
+        table = self.build_box("table", TABLE_HALF_SIZE, TABLE_COLOR, friction=self.table_friction)
+        table.initial_pose = sapien.Pose(TABLE_CENTRE)
+        self.table = table.build_static(name="table")
+        self.objects = self._load_objects()
+
+    def build_box(
+        self,
+        name: str,
+        half_size: tuple[float, float, float],
+        color: tuple[float, float, float, float],
+        *,
+        friction: float,
+        mass: float | None = None,
+    ) -> ActorBuilder:
+        """Return a builder of a box.
+
+        Args:
+            name: for error messages of the builder.
+            half_size: half of each edge, m.
+            color: rgba in [0, 1].
+            friction: material value; PhysX takes the average of the two touching materials.
+            mass: kg; None for a body that never moves.
+        """
+        builder = self.scene.create_actor_builder()
+        builder.set_name(name)
+        material = sapien.physx.PhysxMaterial(friction, friction, 0.0)
+        volume = 8.0 * half_size[0] * half_size[1] * half_size[2]
+        density = 1000.0 if mass is None else mass / volume
+        builder.add_box_collision(half_size=half_size, material=material, density=density)
+        builder.add_box_visual(half_size=half_size, material=sapien.render.RenderMaterial(base_color=color))
+        # Far apart, so that nothing overlaps before the first episode places it.
+        builder.initial_pose = sapien.Pose((0.3, 0.1 * len(self.scene.actors), 0.5))
+        return builder
+
+    # ---- episode ----------------------------------------------------------------------------------------------
+
+    @abstractmethod
+    def _place_objects(self, rng: np.random.RandomState, count: int) -> None:
+        """Set the poses of the objects in the `count` rows that are being reset.
+
+        `rng` draws one value (or array) for each of these rows from the row's own seed: every result has a leading
+        axis of length `count`, and an episode depends on nothing but its seed.
+        """
+
+    def _initialize_episode(self, env_idx: Tensor, options: dict[str, Any]) -> None:
+        with torch.device(self.device):
+            count = len(env_idx)
+            rng = self._batched_episode_rng[env_idx]
+            noise = rng.uniform(-START_JOINT_NOISE, START_JOINT_NOISE, size=6)
+            arm = torch.tensor(np.asarray(self.start_qpos) + noise, dtype=torch.float32)  # (count, 6)
+            fingers = torch.full((count, 2), self.start_opening / 2)
+            self.agent.reset(torch.cat([arm, fingers], dim=1))
+            self.agent.robot.set_pose(sapien.Pose())
+            self._place_objects(rng, count)
+
+    # ---- observation ------------------------------------------------------------------------------------------
+
+    def agent_pos(self) -> Tensor:
+        """Return proprioception (N, 10): see `AGENT_POS_NAMES`."""
+        tcp = self.agent.tcp_pose
+        rotation = quaternion_to_matrix(tcp.q)
+        columns = rotation[:, :, :2].mT.flatten(1)  # first column, then second
+        return torch.cat([tcp.p, columns, self.agent.opening[:, None]], dim=1)
+
+    def privileged_state(self) -> Tensor:
+        """Return what experts and critics may know (N, S), laid out as the spec's `state_layout` says."""
+        poses = [actor.pose.raw_pose for actor in self.objects.values()]
+        own = [self.agent.tcp_pose.raw_pose, self.agent.tcp_target_pose.raw_pose, self.agent.opening[:, None]]
+        return torch.cat(own + poses, dim=1)
+
+    def _get_obs_extra(self, info: dict[str, Any]) -> dict[str, Tensor]:
+        extra = {"tcp_pose": self.agent.tcp_pose.raw_pose, "opening": self.agent.opening}
+        if self.obs_mode_struct.use_state:
+            extra |= {f"{name}_pose": actor.pose.raw_pose for name, actor in self.objects.items()}
+        return extra
+
+    # ---- reward -----------------------------------------------------------------------------------------------
+
+    @abstractmethod
+    def reward_terms(self, info: dict[str, Tensor]) -> dict[str, Tensor]:
+        """Return the named terms (N,), each in [0, 1], under the names of `reward_weights`."""
+
+    def compute_dense_reward(self, obs: Any, action: Tensor, info: dict[str, Tensor]) -> Tensor:
+        """Return the weighted sum of the terms (N,); a success earns the sum of all weights."""
+        terms = self.reward_terms(info)
+        total = sum(weight * terms[name] for name, weight in self.reward_weights.items())
+        return torch.where(info["success"], sum(self.reward_weights.values()), total)
+
+    def compute_normalized_dense_reward(self, obs: Any, action: Tensor, info: dict[str, Tensor]) -> Tensor:
+        """Return the dense reward divided by its largest value: (N,) in [0, 1]."""
+        return self.compute_dense_reward(obs, action, info) / sum(self.reward_weights.values())
+
+
+def _camera_config(uid: str, camera: FixedCamera) -> CameraConfig:
+    height, width = camera.size
+    return CameraConfig(
+        uid, pose=Pose.create(camera.pose), width=width, height=height, fov=camera.fov, near=camera.near, far=camera.far
+    )
+
+
+def pose_error(actor_pose: Pose, reference: Pose) -> tuple[Tensor, Tensor]:
+    """Return how far poses (N,) stand from their references: distance (N,) m, and tilt of the z axis (N,) rad."""
+    distance = (actor_pose.p - reference.p).norm(dim=1)
+    z_now = quaternion_to_matrix(actor_pose.q)[:, :, 2]
+    z_then = quaternion_to_matrix(reference.q)[:, :, 2]
+    return distance, torch.acos((z_now * z_then).sum(dim=1).clamp(-1, 1))

@@ -1,0 +1,97 @@
+"""One row as a Gymnasium environment: what a worker process of the CPU backend runs."""
+
+from __future__ import annotations
+
+import importlib
+from typing import Any
+
+import gymnasium
+import numpy as np
+import torch
+from gymnasium import spaces
+
+from manicm_ms.envs.chunk import ActionChunk
+from manicm_ms.envs.simulator import ENVS, SimulatorConfig
+from manicm_ms.types import AGENT_POS, DEPTH, IMAGE, POINT_CLOUD, STATE, ChunkSpec, EnvSpec
+
+
+def observation_space(spec: EnvSpec, obs: tuple[str, ...], n_obs_steps: int | None) -> spaces.Dict:
+    """Return the space of one row's observation; `n_obs_steps` adds the history axis, None leaves it out."""
+    height, width = spec.obs.image_size
+    shapes = {
+        POINT_CLOUD: (spec.obs.num_points, spec.obs.point_channels),
+        AGENT_POS: (spec.obs.agent_pos_dim,),
+        IMAGE: (height, width, 3),
+        DEPTH: (height, width),
+        STATE: (spec.state_dim,),
+    }
+    history = () if n_obs_steps is None else (n_obs_steps,)
+    boxes: dict[str, spaces.Space[Any]] = {}
+    for key in obs:
+        low, high, dtype = (0, 255, np.uint8) if key == IMAGE else (-np.inf, np.inf, np.float32)
+        boxes[key] = spaces.Box(low, high, history + shapes[key], dtype)  # type: ignore[arg-type]
+    return spaces.Dict(boxes)
+
+
+def action_space(spec: EnvSpec, n_action_steps: int | None) -> spaces.Box:
+    """Return the space of one row's action; `n_action_steps` adds the chunk axis, None leaves it out."""
+    chunk = () if n_action_steps is None else (n_action_steps,)
+    return spaces.Box(-1.0, 1.0, (*chunk, spec.action.dim), np.float32)
+
+
+class RowEnv(gymnasium.Env[dict[str, np.ndarray], np.ndarray]):
+    """One row of a registered environment.
+
+    The simulator is built at the first reset, in the process that will use it: gymnasium's AsyncVectorEnv also makes
+    one environment in the parent, only to read its spaces, and a renderer there would cost memory and seconds.
+    """
+
+    metadata = {"render_modes": ["rgb_array"]}  # noqa: RUF012 (Gymnasium declares it without ClassVar)
+    render_mode = "rgb_array"
+
+    def __init__(self, env_id: str, task_module: str, config: SimulatorConfig, chunk: ChunkSpec | None) -> None:
+        self._env_id, self._task_module, self._config, self._chunk = env_id, task_module, config, chunk
+        importlib.import_module(task_module)  # registers the id in this process, and only this one
+        self.env_spec = config.specialise(ENVS.get_registered(env_id).spec)
+        self.observation_space = observation_space(self.env_spec, config.obs, chunk and chunk.n_obs_steps)
+        self.action_space = action_space(self.env_spec, chunk and chunk.n_action_steps)
+        self._rows: ActionChunk | None = None
+
+    def reset(  # type: ignore[override]
+        self, *, seed: int | None = None, options: dict[str, Any] | None = None
+    ) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
+        """Start the episode that belongs to `seed` (drawn at random where it is None)."""
+        super().reset(seed=seed)
+        if self._rows is None:
+            torch.set_num_threads(1)  # workers share the cores; more threads a worker fight the software renderer
+            simulator = ENVS.get_registered(self._env_id).build(self.env_spec, self._config)
+            self._rows = ActionChunk.from_spec(simulator, self._chunk)
+        seed = int(self.np_random.integers(2**31)) if seed is None else seed
+        history, info = self._rows.reset(torch.zeros(1, dtype=torch.int64), [seed])
+        return self._unbatch(history), self._plain(info)
+
+    def step(self, action: np.ndarray) -> tuple[dict[str, np.ndarray], float, bool, bool, dict[str, Any]]:
+        """Play one action, or a chunk of them."""
+        assert self._rows is not None, "reset before the first step"
+        actions = torch.as_tensor(action, dtype=torch.float32)
+        history, reward, info = self._rows.step(actions[None] if self._chunk else actions[None, None])
+        ended = bool(self._rows.terminated[0]), bool(self._rows.truncated[0])
+        return self._unbatch(history), float(reward[0]), *ended, self._plain(info)
+
+    def render(self) -> np.ndarray:  # type: ignore[override]
+        """Return what the wide camera sees, (H, W, 3) uint8."""
+        assert self._rows is not None, "reset before the first frame"
+        return self._rows.simulator.render_video_frames()[0].cpu().numpy()
+
+    def close(self) -> None:
+        """Free the simulator."""
+        if self._rows is not None:
+            self._rows.simulator.close()
+            self._rows = None
+
+    def _unbatch(self, history: dict[str, torch.Tensor]) -> dict[str, np.ndarray]:
+        return {key: (values[0] if self._chunk else values[0, 0]).numpy() for key, values in history.items()}
+
+    def _plain(self, info: dict[str, torch.Tensor]) -> dict[str, Any]:
+        assert self._rows is not None
+        return {name: values[0].item() for name, values in info.items()} | {"error": self._rows.errors[0] or ""}

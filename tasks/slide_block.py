@@ -1,0 +1,182 @@
+"""Slide Block: push the grey block off the white cube with the end-effector."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from functools import partial
+from typing import ClassVar
+
+import numpy as np
+import sapien
+import torch
+from mani_skill.utils.geometry.rotation_conversions import axis_angle_to_quaternion
+from mani_skill.utils.registration import register_env
+from mani_skill.utils.structs import Actor, Pose
+from torch import Tensor
+
+from manicm_ms.demos.experts import EXPERTS
+from manicm_ms.demos.waypoints import Motion, WaypointFollower, waypoint_table
+from manicm_ms.envs.maniskill import ManiSkillSimulator
+from manicm_ms.envs.simulator import ENVS, EnvEntry
+from manicm_ms.envs.ur3e_tabletop import SPAWN_CLEARANCE, UR3eTabletopEnv, pose_error, ur3e_spec
+from manicm_ms.errors import UnknownNameError
+from manicm_ms.types import EnvSpec
+
+ENV_ID, GYM_ID = "ur3e/slide-block", "UR3eSlideBlock-v1"
+MAX_EPISODE_STEPS = 120
+SPEC = ur3e_spec(ENV_ID, MAX_EPISODE_STEPS, objects=("cube", "block"))
+
+CUBE_HALF = 0.030  # m
+BLOCK_HALF = (0.020, 0.020, 0.015)  # m
+CUBE_MASS, BLOCK_MASS = 0.20, 0.05  # kg
+CUBE_FRICTION, BLOCK_FRICTION, TABLE_FRICTION = 0.4, 0.2, 0.8  # material values; a pair acts with their average
+WHITE, GREY = (0.92, 0.92, 0.90, 1.0), (0.35, 0.36, 0.38, 1.0)
+
+FALLEN_HEIGHT = 0.045  # m: below it the block's centre is no longer on the cube
+MAX_CUBE_SHIFT, MAX_CUBE_TILT = 0.02, np.deg2rad(10)
+STILL_SPEED, STILL_TURN = 0.01, 0.5  # m/s, rad/s
+
+
+@register_env(GYM_ID, max_episode_steps=MAX_EPISODE_STEPS)
+class SlideBlockEnv(UR3eTabletopEnv):
+    """Push the grey block off the white cube without moving the cube.
+
+    **Randomisation** (per row, from its seed): the cube's centre in x 0.25..0.35 m, y -0.08..0.08 m, yaw +-15 deg; the
+    block on top of it, off centre by up to 5 mm in x and y, turned by up to 15 deg against it; arm joints by 0.02 rad.
+
+    **Success**: the block lies beside the cube on the table, cube and block are still, and the cube was moved by less
+    than 2 cm and tilted by less than 10 deg. **Failure**: the cube was moved or tilted further, or the block fell off
+    the table.
+    """
+
+    # TCP at (0.30, 0, 0.25) m, tool down, the fingers' flat sides facing +y and -y.
+    start_qpos: ClassVar[tuple[float, ...]] = (-0.452075, -1.507987, 0.854125, -0.916934, -1.570796, -2.022871)
+    start_opening: ClassVar[float] = 0.0
+    table_friction: ClassVar[float] = TABLE_FRICTION
+    reward_weights: ClassVar[dict[str, float]] = {"reach": 1.0, "push": 2.0, "fall": 1.0, "cube_in_place": 1.0}
+
+    def _load_objects(self) -> dict[str, Actor]:
+        cube = self.build_box("cube", (CUBE_HALF,) * 3, WHITE, friction=CUBE_FRICTION, mass=CUBE_MASS)
+        self.cube = cube.build(name="cube")
+        block = self.build_box("block", BLOCK_HALF, GREY, friction=BLOCK_FRICTION, mass=BLOCK_MASS)
+        self.block = block.build(name="block")
+        self.cube_start = Pose.create(sapien.Pose()).raw_pose.to(self.device).repeat(self.num_envs, 1)  # (N, 7)
+        return {"cube": self.cube, "block": self.block}
+
+    def _place_objects(self, rng: np.random.RandomState, count: int) -> None:
+        rows = self.scene._reset_mask
+        yaw = torch.as_tensor(rng.uniform(-np.pi / 12, np.pi / 12, size=2), dtype=torch.float32)  # (count, 2)
+        xy = torch.as_tensor(rng.uniform((0.25, -0.08), (0.35, 0.08)), dtype=torch.float32)
+        off = torch.as_tensor(rng.uniform(-0.005, 0.005, size=2), dtype=torch.float32)
+
+        on_table = torch.full((count, 1), CUBE_HALF + SPAWN_CLEARANCE)
+        cube = Pose.create_from_pq(torch.cat([xy, on_table], dim=1), _yaw_quat_wxyz(yaw[:, 0]))
+        on_cube = torch.full((count, 1), 2 * CUBE_HALF + BLOCK_HALF[2] + 2 * SPAWN_CLEARANCE)
+        block = Pose.create_from_pq(torch.cat([xy + off, on_cube], dim=1), _yaw_quat_wxyz(yaw.sum(dim=1)))
+        self.cube.set_pose(cube)
+        self.block.set_pose(block)
+        self.cube_start[rows] = cube.raw_pose
+
+    def evaluate(self) -> dict[str, Tensor]:
+        """Return per-row booleans (N,): success, fail, block_fallen, block_fell_wrong, cube_moved, still."""
+        centre = self.block.pose.p
+        in_cube = (self.cube.pose.inv() * self.block.pose).p
+        beside = (in_cube[:, :2].abs() > CUBE_HALF).any(dim=1)
+        fallen = (centre[:, 2] > 0) & (centre[:, 2] < FALLEN_HEIGHT) & beside
+        shift, tilt = pose_error(self.cube.pose, Pose.create(self.cube_start))
+        moved = (shift > MAX_CUBE_SHIFT) | (tilt > MAX_CUBE_TILT)
+        still = self.cube.is_static(STILL_SPEED, STILL_TURN) & self.block.is_static(STILL_SPEED, STILL_TURN)
+        off_table = centre[:, 2] < 0
+        return {
+            "success": fallen & still & ~moved,
+            "fail": moved | off_table,
+            "block_fallen": fallen,
+            "block_fell_wrong": off_table | (fallen & moved),
+            "cube_moved": moved,
+            "still": still,
+        }
+
+    def reward_terms(self, info: dict[str, Tensor]) -> dict[str, Tensor]:
+        """Return the named terms, each (N,) in [0, 1].
+
+        reach: the TCP comes near the block. push: the block leaves the cube's centre, full at the cube's edge.
+        fall: the block lies beside the cube. cube_in_place: the cube stays where it was.
+        """
+        block, cube = self.block.pose.p, self.cube.pose.p
+        distance = (self.agent.tcp_pose.p - block).norm(dim=1)
+        slid = (block - cube)[:, :2].norm(dim=1)
+        shift, _ = pose_error(self.cube.pose, Pose.create(self.cube_start))
+        return {
+            "reach": 1 - torch.tanh(5 * distance),
+            "push": (slid / (CUBE_HALF + BLOCK_HALF[0])).clamp(max=1),
+            "fall": info["block_fallen"].float(),
+            "cube_in_place": 1 - (shift / MAX_CUBE_SHIFT).clamp(max=1),
+        }
+
+
+def _yaw_quat_wxyz(yaw: Tensor) -> Tensor:
+    """Return the rotation by `yaw` (N,) rad about z as quaternions (N, 4)."""
+    return axis_angle_to_quaternion(torch.stack([torch.zeros_like(yaw), torch.zeros_like(yaw), yaw], dim=1))
+
+
+ENVS.add(ENV_ID, EnvEntry(SPEC, partial(ManiSkillSimulator, gym_id=GYM_ID), __name__), tags=("ur3e", "real-robot"))
+
+
+# ---- expert ---------------------------------------------------------------------------------------------------
+
+BEHIND, BEYOND = 0.062, 0.065  # m before and past the block's centre: where the push begins and ends
+APPROACH_Z, PUSH_Z, RETREAT_Z = 0.127, 0.089, 0.160  # m, TCP; while pushing the tip is 12 mm above the cube
+FREE_SPEED, LOWER_SPEED, PUSH_SPEED, RETREAT_SPEED = 0.22, 0.12, 0.10, 0.15  # m/s
+
+
+@EXPERTS.register(ENV_ID)
+class SlideBlockExpert:
+    """Goes behind the block, lowers the closed fingers and pushes it over the edge.
+
+    Args:
+        spec: the environment's spec.
+        num_envs: N.
+        device: where states and actions live.
+        style: "one-sided" pushes towards +y; "two-sided" draws +y or -y for each episode from its seed.
+    """
+
+    name = "slide-block way-points"
+    styles = ("one-sided", "two-sided")
+
+    def __init__(self, spec: EnvSpec, num_envs: int, device: torch.device | str, style: str | None = None) -> None:
+        self.style = style or self.styles[0]
+        if self.style not in self.styles:
+            raise UnknownNameError("expert style", self.style, self.styles)
+        self._layout = spec.state_layout
+        self._follower = WaypointFollower(spec, num_envs, Motion(control_hz=spec.action.control_hz), device)
+
+    def reset(self, state: Tensor, seeds: Sequence[int], mask: Tensor) -> None:
+        """Plan the episodes of the rows in `mask` (N,) from their first state (N, S) and seeds (N)."""
+        start, _ = self._layout["block_pose"]
+        block = state[:, start : start + 3].double()
+        side = self._sides(seeds).to(block)  # (N,) +1 or -1
+
+        def at(along: float, height: float) -> Tensor:
+            return torch.stack([block[:, 0], block[:, 1] + side * along, torch.full_like(side, height)], dim=1)
+
+        way = [
+            (at(-BEHIND, APPROACH_Z), 0.0, 0.0, FREE_SPEED, 0),
+            (at(-BEHIND, PUSH_Z), 0.0, 0.0, LOWER_SPEED, 0),
+            (at(BEYOND, PUSH_Z), 0.0, 0.0, PUSH_SPEED, 0),
+            (at(BEYOND, RETREAT_Z), 0.0, 0.0, RETREAT_SPEED, 0),
+        ]
+        self._follower.reset(waypoint_table(way, block), mask)
+
+    def act(self, state: Tensor) -> Tensor:
+        """Return the next action (N, 7) in [-1, 1] for the state (N, S)."""
+        return self._follower.act(state)
+
+    def _sides(self, seeds: Sequence[int]) -> Tensor:
+        if self.style == "one-sided":
+            return torch.ones(len(seeds))
+        return torch.tensor([_coin(seed) for seed in seeds])
+
+
+def _coin(seed: int) -> float:
+    """Return +1 or -1, drawn from a stream of its own so that the scene does not tell the side."""
+    return float(np.random.default_rng([seed, 0x51DE]).choice([-1.0, 1.0]))
