@@ -1,7 +1,7 @@
 """Geometry of point clouds: position image to base frame, crop, farthest-point order, deterministic padding.
 
-One CPU row goes through NumPy and fpsample; a batch on an accelerator goes through torch. Both follow the same
-definition (start at the first point, ties to the lowest index), and a test holds them equal.
+One CPU row goes through NumPy and fpsample; a batch on an accelerator goes through torch. Both are exact farthest-point
+sampling and deterministic; they differ in the point that they start from (see `farthest_point_order`).
 """
 
 from __future__ import annotations
@@ -43,10 +43,12 @@ def inside(points: Tensor, box: Box) -> Tensor:
 
 
 def farthest_point_order(xyz: NDArray[np.float32], count: int) -> NDArray[np.int64]:
-    """Return the indices of `count` points in farthest-point order, starting at point 0.
+    """Return the indices of `count` points in farthest-point order.
 
     Farthest point sampling (Eldar et al. 1997; Qi et al. 2017, PointNet++): each next point is the one
     farthest from all chosen before, so that every prefix of the result is itself an even subsample.
+    The first point depends on the cloud alone: fpsample's tree decides it (its `start_idx` counts in the
+    tree's order, not the caller's); without fpsample it is point 0.
 
     Args:
         xyz: (M, 3) float32, metres.
