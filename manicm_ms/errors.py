@@ -66,3 +66,7 @@ class RenderDeviceError(ManicmError):
 
 class BackendError(ManicmError):
     """A simulation backend that this machine cannot run."""
+
+
+class TrainingDivergedError(ManicmError):
+    """A training whose loss became NaN or infinite."""

@@ -1,0 +1,63 @@
+"""Where and in which precision to train: `auto` becomes what the machine does well."""
+
+from __future__ import annotations
+
+import torch
+from lightning_fabric import Fabric
+
+from manicm_ms.errors import ConfigError
+
+PRECISIONS = ("auto", "32-true", "bf16-mixed", "16-mixed")
+"""32-true: all in float32. bf16-mixed, 16-mixed: products in 16 bits, weights and averages in float32."""
+
+
+def resolve_device(asked: str) -> torch.device:
+    """Return the device that `asked` ("auto", "cpu", "cuda", "cuda:1") names; auto prefers CUDA.
+
+    Raises ConfigError where the machine has no such device.
+    """
+    if asked == "auto":
+        return torch.device("cuda", 0) if torch.cuda.is_available() else torch.device("cpu")
+    try:
+        device = torch.device(asked)
+    except RuntimeError:
+        raise ConfigError(f"unknown device {asked!r}: use auto, cpu, cuda or cuda:N") from None
+    if device.type not in ("cpu", "cuda"):
+        raise ConfigError(f"device {asked!r} is not supported: use auto, cpu, cuda or cuda:N")
+    if device.type == "cuda":
+        device = torch.device("cuda", device.index or 0)
+        if not torch.cuda.is_available() or device.index >= torch.cuda.device_count():
+            raise ConfigError(f"device {asked!r}: {torch.cuda.device_count()} CUDA devices found; use --device cpu")
+    return device
+
+
+def resolve_precision(asked: str, device: torch.device) -> str:
+    """Return the precision that `asked` (one of `PRECISIONS`) means on `device`.
+
+    auto is bf16-mixed where the hardware multiplies bfloat16 (on a CPU: AVX512_BF16 or AMX, where it halves
+    the time of a step) and 32-true elsewhere: emulated bfloat16 is slower than float32.
+    """
+    if asked not in PRECISIONS:
+        raise ConfigError(f"unknown precision {asked!r}: known: {', '.join(PRECISIONS)}")
+    if asked == "16-mixed" and device.type == "cpu":
+        raise ConfigError("precision 16-mixed needs a CUDA device: use bf16-mixed or 32-true on a CPU")
+    if asked != "auto":
+        return asked
+    if device.type == "cuda":
+        native = torch.cuda.is_bf16_supported(including_emulation=False)
+    else:
+        capabilities = torch.cpu.get_capabilities()
+        native = capabilities.get("avx512_bf16", False) or capabilities.get("amx_bf16", False)
+    return "bf16-mixed" if native else "32-true"
+
+
+def make_fabric(device: torch.device, precision: str, num_devices: int = 1) -> Fabric:
+    """Return a launched Fabric; with more than one device this starts one process for each (DDP).
+
+    Call it before anything is written: the other processes run the same command from its beginning.
+    """
+    devices = [device.index] if device.type == "cuda" and num_devices == 1 else num_devices
+    strategy = "auto" if num_devices == 1 else "ddp"
+    fabric = Fabric(accelerator=device.type, devices=devices, strategy=strategy, precision=precision)
+    fabric.launch()
+    return fabric
