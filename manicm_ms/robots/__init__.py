@@ -1,1 +1,1 @@
-"""Robots as ManiSkill agents, one file each."""
+"""Robots as ManiSkill agents; importing a module registers its agent."""
