@@ -4,7 +4,9 @@ A working system driver needs nothing from here. Where `make setup` had to choos
 unpacked into `.vulkan/` without root, or the system's lavapipe beside an NVIDIA driver that cannot render),
 it left a manifest `.vulkan/vulkan.json`::
 
-    {"driver": "/abs/lvp_icd.json", "preload": ["/abs/libdrm.so.2", ...]}
+    {"driver": "lvp_icd.json", "preload": ["root/usr/lib/x86_64-linux-gnu/libdrm.so.2", ...]}
+
+(paths relative to the folder, or absolute).
 
 `MANICM_MS_VULKAN` names another folder with such a manifest, or is `system` to ignore all of them.
 
@@ -62,7 +64,7 @@ def folder() -> Path | None:
     if named:
         if not (Path(named) / MANIFEST).is_file():
             raise RenderDeviceError(
-                f"{FOLDER_VARIABLE}={named} holds no {MANIFEST}: unset it or run 'make setup' and name its .vulkan folder"
+                f"{FOLDER_VARIABLE}={named} holds no {MANIFEST}: unset it or name a folder that 'make setup' made"
             )
         return Path(named)
     beside = Path(__file__).resolve().parents[1] / ".vulkan"
@@ -79,6 +81,7 @@ def prepare() -> None:
     where = folder()
     if where is None:
         return
+    where = where.absolute()
     driver, preload = _read_manifest(where / MANIFEST)
     chosen = os.environ.get(_DRIVER_VARIABLE) or os.environ.get("VK_ICD_FILENAMES")
     if chosen and chosen != driver:
@@ -92,7 +95,7 @@ def prepare() -> None:
 def _read_manifest(path: Path) -> tuple[str, list[str]]:
     try:
         manifest = json.loads(path.read_text(encoding="utf-8"))
-        driver, preload = str(manifest["driver"]), [str(p) for p in manifest["preload"]]
+        driver, *preload = (str(path.parent / p) for p in (manifest["driver"], *manifest["preload"]))
     except (OSError, ValueError, KeyError, TypeError) as error:
         raise RenderDeviceError(f"{path} cannot be read ({error}): {REMEDY}") from error
     missing = [p for p in (driver, *preload) if not Path(p).is_file()]
