@@ -14,7 +14,14 @@ from mani_skill.utils.structs import Pose
 from torch import Tensor
 
 from manicm_ms.errors import ConfigError
-from manicm_ms.robots.limits import clamp_norm, clamp_to_workspace, limit_joint_step, limit_lead, quat_from_rotvec
+from manicm_ms.robots.limits import (
+    clamp_norm,
+    clamp_to_workspace,
+    limit_joint_step,
+    limit_lead,
+    pose_in_frame,
+    quat_from_rotvec,
+)
 from manicm_ms.robots.limits import quat_multiply as multiply
 
 
@@ -43,6 +50,11 @@ class LimitedPoseController(PDEEPoseController):
         self._max_joint_step = speed / self._control_freq
         self._workspace_lower = torch.tensor(self.config.workspace_lower, device=self.device)
         self._workspace_upper = torch.tensor(self.config.workspace_upper, device=self.device)
+
+    @property
+    def ee_pose_at_base(self) -> Pose:
+        """Measured end-effector pose in the base frame, N rows; the fewer tensor operations per step, the better."""
+        return Pose.create(pose_in_frame(self.ee_link.pose.raw_pose, self.root_link.pose.raw_pose))
 
     def _clip_and_scale_action_space(self) -> None:
         super()._clip_and_scale_action_space()

@@ -37,6 +37,20 @@ def rotvec_from_quat(q: Tensor) -> Tensor:
     return q[:, 1:] * torch.where(sine > 1e-9, angle / sine.clamp_min(1e-9), torch.full_like(sine, 2.0))
 
 
+def quat_rotate(q: Tensor, vectors: Tensor) -> Tensor:
+    """Turn vectors (N, 3) by unit wxyz quaternions (N, 4)."""
+    axis = q[:, 1:]
+    cross = 2.0 * torch.linalg.cross(axis, vectors)
+    return vectors + q[:, :1] * cross + torch.linalg.cross(axis, cross)
+
+
+def pose_in_frame(pose: Tensor, frame: Tensor) -> Tensor:
+    """Express poses (N, 7) (xyz metres, wxyz) in the frames (N, 7) given in the same coordinates."""
+    to_frame = quat_conjugate(frame[:, 3:])
+    position = quat_rotate(to_frame, pose[:, :3] - frame[:, :3])
+    return torch.cat([position, quat_multiply(to_frame, pose[:, 3:])], dim=1)
+
+
 def clamp_norm(vectors: Tensor, most: float) -> Tensor:
     """Shorten those of the vectors (N, k) that are longer than `most`; directions stay."""
     norm = torch.linalg.norm(vectors, dim=1, keepdim=True)

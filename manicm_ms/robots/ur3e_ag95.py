@@ -20,6 +20,7 @@ from torch import Tensor
 
 from manicm_ms.paths import asset
 from manicm_ms.robots.controllers import LimitedPoseControllerConfig, OpeningControllerConfig
+from manicm_ms.robots.limits import pose_in_frame
 
 ARM_JOINTS = (
     "shoulder_pan_joint",
@@ -185,7 +186,7 @@ class UR3eAG95(BaseAgent):
     @property
     def tcp_pose_at_base(self) -> Tensor:
         """Measured pose of the tcp in the base frame, (N, 7): xyz metres, wxyz."""
-        return (self.robot.pose.inv() * self.tcp.pose).raw_pose
+        return pose_in_frame(self.tcp.pose.raw_pose, self.robot.pose.raw_pose)
 
     @property
     def tcp_target_pose(self) -> Tensor:
