@@ -1,0 +1,277 @@
+"""The diffusion teacher: clean action and noise as separate quantities, DDIM sampling, the one-step control."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass
+from typing import Any, Protocol
+
+import torch
+from diffusers import DDIMScheduler, DDPMScheduler
+from torch import Tensor
+
+from manicm_ms.errors import ConfigError
+from manicm_ms.policies.base import ChannelStats, Policy, check_obs, starting_noise
+from manicm_ms.policies.denoiser import ConditionedDenoiser
+from manicm_ms.policies.normalizer import Normalizer
+from manicm_ms.registry import Registry
+from manicm_ms.types import ACTION, ChunkSpec, EnvSpec
+
+
+def epsilon_from_x0(x_t: Tensor, x0: Tensor, alpha_bar: Tensor) -> Tensor:
+    """Return the noise in x_t, given its clean part: epsilon = (x_t - sqrt(abar) x0) / sqrt(1 - abar).
+
+    Inverts x_t = sqrt(abar) x0 + sqrt(1 - abar) epsilon (Ho et al. 2020, equation 4).
+
+    Args:
+        x_t: (B, Tp, Da) noisy actions.
+        x0: (B, Tp, Da) clean actions.
+        alpha_bar: broadcastable to them, cumulative product of the alphas at t, below 1.
+    """
+    return (x_t - alpha_bar.sqrt() * x0) / (1 - alpha_bar).sqrt()
+
+
+def x0_from_epsilon(x_t: Tensor, epsilon: Tensor, alpha_bar: Tensor) -> Tensor:
+    """Return the clean part of x_t, given its noise: x0 = (x_t - sqrt(1 - abar) epsilon) / sqrt(abar).
+
+    Arguments as those of `epsilon_from_x0`, alpha_bar above 0.
+    """
+    return (x_t - (1 - alpha_bar).sqrt() * epsilon) / alpha_bar.sqrt()
+
+
+class Prediction(Protocol):
+    """What the network's output means; all arrays are (B, Tp, Da), alpha_bar broadcasts to them."""
+
+    def target(self, x0: Tensor, epsilon: Tensor) -> Tensor:
+        """Return what the network is trained to output."""
+
+    def x0(self, output: Tensor, x_t: Tensor, alpha_bar: Tensor) -> Tensor:
+        """Return the clean action that an output implies."""
+
+
+PREDICTIONS: Registry[type[Prediction]] = Registry("prediction_type")
+
+
+@PREDICTIONS.register("sample")
+class SamplePrediction:
+    """The network outputs the clean action x0."""
+
+    def target(self, x0: Tensor, epsilon: Tensor) -> Tensor:
+        """Return `x0`."""
+        del epsilon
+        return x0
+
+    def x0(self, output: Tensor, x_t: Tensor, alpha_bar: Tensor) -> Tensor:
+        """Return `output`."""
+        del x_t, alpha_bar
+        return output
+
+
+@PREDICTIONS.register("epsilon")
+class EpsilonPrediction:
+    """The network outputs the noise epsilon."""
+
+    def target(self, x0: Tensor, epsilon: Tensor) -> Tensor:
+        """Return `epsilon`."""
+        del x0
+        return epsilon
+
+    def x0(self, output: Tensor, x_t: Tensor, alpha_bar: Tensor) -> Tensor:
+        """Return the clean action; see `x0_from_epsilon`."""
+        return x0_from_epsilon(x_t, output, alpha_bar)
+
+
+@dataclass(frozen=True)
+class DiffusionConfig:
+    """The noising process and its sampler.
+
+    Attributes:
+        num_train_timesteps: T; times run from 0 (almost clean) to T - 1 (noise).
+        num_inference_steps: network evaluations of one decision.
+        beta_schedule: diffusers' name of the noise schedule.
+        prediction_type: what the network outputs, a name in `PREDICTIONS`.
+        clip_range: clean actions are clipped to [-clip_range, clip_range] (normalised units) at each step.
+    """
+
+    num_train_timesteps: int = 100
+    num_inference_steps: int = 10
+    beta_schedule: str = "squaredcos_cap_v2"
+    prediction_type: str = "sample"
+    clip_range: float = 1.0
+
+    def __post_init__(self) -> None:
+        PREDICTIONS.get(self.prediction_type)
+        if not 1 <= self.num_inference_steps <= self.num_train_timesteps:
+            raise ConfigError(
+                f"num_inference_steps={self.num_inference_steps} must lie between 1 and "
+                f"num_train_timesteps={self.num_train_timesteps}"
+            )
+
+    def ddpm(self) -> DDPMScheduler:
+        """Return the noising process for training."""
+        return DDPMScheduler(**self._shared())
+
+    def ddim(self, num_inference_steps: int) -> DDIMScheduler:
+        """Return the deterministic sampler over "leading" timesteps (90, 80, ..., 0 for 10 of 100 steps)."""
+        scheduler = DDIMScheduler(**self._shared(), set_alpha_to_one=True, steps_offset=0)
+        scheduler.set_timesteps(num_inference_steps)
+        return scheduler
+
+    def _shared(self) -> dict[str, Any]:
+        return {
+            "num_train_timesteps": self.num_train_timesteps,
+            "beta_schedule": self.beta_schedule,
+            "prediction_type": self.prediction_type,
+            "clip_sample": True,
+            "clip_sample_range": self.clip_range,
+            "timestep_spacing": "leading",
+        }
+
+
+class DiffusionPolicy(Policy):
+    """Samples an action chunk by DDIM from a network conditioned on the observation (DP3, Ze et al. 2024).
+
+    Args:
+        name: in `POLICIES`.
+        network: encoder, U-Net and normaliser.
+        spec: the environment that it is made for.
+        chunk: To, Tp, Ta.
+        diffusion: noising process and sampler.
+    """
+
+    def __init__(
+        self, name: str, network: ConditionedDenoiser, spec: EnvSpec, chunk: ChunkSpec, diffusion: DiffusionConfig
+    ) -> None:
+        super().__init__()
+        self.name, self.spec, self.chunk, self.diffusion = name, spec, chunk, diffusion
+        self.network = network
+        self.prediction: Prediction = PREDICTIONS.get(diffusion.prediction_type)()
+        self.register_buffer("alphas_cumprod", diffusion.ddpm().alphas_cumprod.clone(), persistent=False)
+        self._samplers: dict[int, DDIMScheduler] = {}
+
+    @property
+    def nfe(self) -> int:
+        """Number of DDIM steps."""
+        return self.diffusion.num_inference_steps
+
+    @property
+    def normalizer(self) -> Normalizer:
+        """The network's normaliser."""
+        return self.network.normalizer
+
+    def config_dict(self) -> dict[str, Any]:
+        """Return the sections `network` and `diffusion`."""
+        return {"network": asdict(self.network.config), "diffusion": asdict(self.diffusion)}
+
+    def fit_normalizer(self, stats: Mapping[str, ChannelStats]) -> None:
+        """Set the normaliser from the ranges of `point_cloud`, `agent_pos` and `action`."""
+        self.network.normalizer.fit(stats)
+
+    def add_noise(self, x0: Tensor, epsilon: Tensor, t: Tensor) -> Tensor:
+        """Return x_t = sqrt(abar_t) x0 + sqrt(1 - abar_t) epsilon, all (B, Tp, Da), for integer times t (B,)."""
+        alpha_bar = self.alphas_cumprod[t][:, None, None]
+        return alpha_bar.sqrt() * x0 + (1 - alpha_bar).sqrt() * epsilon
+
+    def predict_x0(self, x_t: Tensor, t: Tensor, cond: Tensor) -> Tensor:
+        """Return the clean chunk that the network sees in a noisy one, clipped as in sampling.
+
+        Args:
+            x_t: (B, Tp, Da) normalised noisy actions.
+            t: (B,) int64 times.
+            cond: (B, cond_dim) features from `network.encode`.
+
+        Returns:
+            (B, Tp, Da) normalised, within the clipping range.
+        """
+        output = self.network.denoise(x_t, t, cond).float()
+        x0 = self.prediction.x0(output, x_t, self.alphas_cumprod[t][:, None, None])
+        return x0.clamp(-self.diffusion.clip_range, self.diffusion.clip_range)
+
+    def sample(self, cond: Tensor, noise: Tensor, num_inference_steps: int | None = None) -> Tensor:
+        """Return a normalised chunk (B, Tp, Da) denoised from `noise` (B, Tp, Da) by DDIM without added noise."""
+        sampler = self._sampler(num_inference_steps or self.diffusion.num_inference_steps)
+        x_t = noise
+        for t in sampler.timesteps.tolist():
+            output = self.network.denoise(x_t, torch.full((len(x_t),), t, device=x_t.device), cond).float()
+            x_t = sampler.step(output, t, x_t).prev_sample
+        return x_t
+
+    @torch.inference_mode()
+    def act(
+        self,
+        obs: Mapping[str, Tensor],
+        *,
+        generator: torch.Generator | None = None,
+        noise: Tensor | None = None,
+        num_inference_steps: int | None = None,
+    ) -> Tensor:
+        """Choose the next actions; see `Policy.act`. `num_inference_steps` overrides the configured number."""
+        batch = check_obs(obs, self.spec, self.chunk)
+        (start,) = starting_noise(self, batch, generator, noise)
+        chunk = self.sample(self.network.encode(obs), start, num_inference_steps)
+        return executed_actions(self, chunk)
+
+    def _sampler(self, steps: int) -> DDIMScheduler:
+        if steps not in self._samplers:
+            self._samplers[steps] = self.diffusion.ddim(steps)
+        return self._samplers[steps]
+
+
+class OneStepTeacher(Policy):
+    """The control for distillation: the undistilled teacher's own guess at x0 from pure noise, in one evaluation.
+
+    Args:
+        teacher: the policy that is run at its last training time only; its weights are shared.
+    """
+
+    registered = False
+
+    def __init__(self, teacher: DiffusionPolicy) -> None:
+        super().__init__()
+        self.teacher = teacher
+        self.name, self.spec, self.chunk = f"{teacher.name}_one_step", teacher.spec, teacher.chunk
+
+    @property
+    def nfe(self) -> int:
+        """One."""
+        return 1
+
+    @property
+    def network(self) -> ConditionedDenoiser:
+        """The teacher's network."""
+        return self.teacher.network
+
+    @property
+    def normalizer(self) -> Normalizer:
+        """The teacher's normaliser."""
+        return self.teacher.normalizer
+
+    def config_dict(self) -> dict[str, Any]:
+        """Return the teacher's configuration."""
+        return self.teacher.config_dict()
+
+    def fit_normalizer(self, stats: Mapping[str, ChannelStats]) -> None:
+        """Set the teacher's normaliser."""
+        self.teacher.fit_normalizer(stats)
+
+    @torch.inference_mode()
+    def act(
+        self, obs: Mapping[str, Tensor], *, generator: torch.Generator | None = None, noise: Tensor | None = None
+    ) -> Tensor:
+        """Choose the next actions; see `Policy.act`."""
+        batch = check_obs(obs, self.spec, self.chunk)
+        (start,) = starting_noise(self, batch, generator, noise)
+        last = torch.full((batch,), self.teacher.diffusion.num_train_timesteps - 1, device=start.device)
+        return executed_actions(self, self.teacher.predict_x0(start, last, self.network.encode(obs)))
+
+
+class _HasNormalizer(Protocol):
+    chunk: ChunkSpec
+
+    @property
+    def normalizer(self) -> Normalizer: ...
+
+
+def executed_actions(policy: _HasNormalizer, chunk: Tensor) -> Tensor:
+    """Return the executed part (B, Ta, Da) of a normalised chunk (B, Tp, Da), in env units clipped to [-1, 1]."""
+    return policy.normalizer.unnormalize(ACTION, chunk[:, policy.chunk.executed]).clamp(-1.0, 1.0)

@@ -1,0 +1,1 @@
+"""Observation encoders: point clouds and proprioception to feature vectors."""
