@@ -79,7 +79,7 @@ class ManiSkillSimulator(Simulator):
         position = pictures[CLOUD_POSITION]  # (n, H, W, 4) int32
         frame: dict[str, Tensor] = {}
         if POINT_CLOUD in wanted:
-            frame[POINT_CLOUD] = self._cloud(position, pictures.get(COLOR))
+            frame[POINT_CLOUD] = self._cloud(position, pictures[COLOR] if self.config.colors else None)
         if DEPTH in wanted:
             frame[DEPTH] = -position[..., 2] * MICROMETRE
         if IMAGE in wanted:

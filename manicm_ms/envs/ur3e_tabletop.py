@@ -40,7 +40,8 @@ TABLE_COLOR = (0.55, 0.47, 0.38, 1.0)
 SPAWN_CLEARANCE = 3e-4  # m above rest: nothing has to settle, nothing interpenetrates
 START_JOINT_NOISE = 0.02  # rad, uniform to either side
 
-_SHARED_STATE = {"tcp_pose": 7, "tcp_target_pose": 7, "opening": 1}
+_SHARED_STATE = {"tcp_pose": 7, "tcp_target_pose": 7, "opening": 1, "arm_qpos": 6, "arm_qvel": 6}
+"""Parts of the privileged state that every task has, with their widths: poses, m, rad, rad/s."""
 
 
 def ur3e_spec(env_id: str, max_episode_steps: int, objects: tuple[str, ...]) -> EnvSpec:
@@ -174,19 +175,19 @@ class UR3eTabletopEnv(BaseEnv):
 
     def agent_pos(self) -> Tensor:
         """Return proprioception (N, 10): see `AGENT_POS_NAMES`."""
-        tcp = self.agent.tcp_pose
-        rotation = quaternion_to_matrix(tcp.q)
-        columns = rotation[:, :, :2].mT.flatten(1)  # first column, then second
-        return torch.cat([tcp.p, columns, self.agent.opening[:, None]], dim=1)
+        tcp = self.agent.tcp_pose_at_base
+        columns = quaternion_to_matrix(tcp[:, 3:])[:, :, :2].mT.flatten(1)  # first column, then second
+        return torch.cat([tcp[:, :3], columns, self.agent.opening[:, None]], dim=1)
 
     def privileged_state(self) -> Tensor:
         """Return what experts and critics may know (N, S), laid out as the spec's `state_layout` says."""
         poses = [actor.pose.raw_pose for actor in self.objects.values()]
-        own = [self.agent.tcp_pose.raw_pose, self.agent.tcp_target_pose.raw_pose, self.agent.opening[:, None]]
+        robot = self.agent
+        own = [robot.tcp_pose_at_base, robot.tcp_target_pose, robot.opening[:, None], robot.arm_qpos, robot.arm_qvel]
         return torch.cat(own + poses, dim=1)
 
     def _get_obs_extra(self, info: dict[str, Any]) -> dict[str, Tensor]:
-        extra = {"tcp_pose": self.agent.tcp_pose.raw_pose, "opening": self.agent.opening}
+        extra = {"tcp_pose": self.agent.tcp_pose_at_base, "opening": self.agent.opening}
         if self.obs_mode_struct.use_state:
             extra |= {f"{name}_pose": actor.pose.raw_pose for name, actor in self.objects.items()}
         return extra

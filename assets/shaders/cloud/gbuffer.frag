@@ -14,6 +14,10 @@ layout(set = 0, binding = 0) uniform CameraBuffer {
   float height;
 } cameraBuffer;
 
+layout(set = 1, binding = 0) uniform ObjectTransformBuffer {
+  mat4 modelMatrix;
+} objectTransformBuffer;
+
 layout(set = 1, binding = 1) uniform ObjectDataBuffer {
   uvec4 segmentation;
   float transparency;
@@ -35,6 +39,35 @@ layout(set = 2, binding = 0) uniform MaterialBuffer {
 } materialBuffer;
 
 layout(set = 2, binding = 1) uniform sampler2D colorTexture;
+layout(set = 2, binding = 2) uniform sampler2D roughnessTexture;
+layout(set = 2, binding = 3) uniform sampler2D normalTexture;
+layout(set = 2, binding = 4) uniform sampler2D metallicTexture;
+layout(set = 2, binding = 5) uniform sampler2D emissionTexture;
+
+// The renderer looks these buffers up by name, so they are declared although no light is evaluated.
+struct PointLight {
+  vec4 position;
+  vec4 emission;
+};
+
+struct DirectionalLight {
+  vec4 direction;
+  vec4 emission;
+};
+
+struct SpotLight {
+  vec4 position;
+  vec4 direction;
+  vec4 emission;
+};
+
+layout(set = 3, binding = 0) uniform SceneBuffer {
+  vec4 ambientLight;
+  DirectionalLight directionalLights[3];
+  SpotLight spotLights[10];
+  PointLight pointLights[10];
+  SpotLight texturedLights[1];
+} sceneBuffer;
 
 layout(location = 0) in vec4 inPosition;
 layout(location = 1) in vec2 inUV;
