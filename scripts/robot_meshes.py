@@ -88,6 +88,16 @@ def tube(axis: str, centre: Sequence[float], radius: float, length: float) -> li
     return [Part(lathe([(radius, -half), (radius, half)], axis, centre), ALUMINIUM)]
 
 
+def stub(radius: float, low: float) -> list[Part]:
+    """Build the neck of a joint housing: along z from its seam at `low` up to the axis of the housing it carries."""
+    seam = 0.05 * radius
+    inner = 0.97 * radius
+    return [
+        Part(lathe([(inner, low), (inner, low + seam)], "z", (0, 0, 0)), SEAM),
+        Part(lathe([(inner, low + seam), (radius, low + seam), (radius, 0)], "z", (0, 0, 0)), ALUMINIUM),
+    ]
+
+
 def prism(outline: NDArray[np.float64], low: float, high: float) -> trimesh.Trimesh:
     """Extrude a convex outline (k, 2) of (x, z) points, counter-clockwise seen from -y, along y from low to high."""
     k = len(outline)
@@ -149,8 +159,7 @@ def _arm() -> dict[str, list[Part]]:
     return {
         "base_link_inertia": _base(),
         "shoulder_link": [
-            *tube("z", (0, 0, -0.0285), 0.045, 0.057),
-            *housing("z", (0, 0, 0), 0.045, (-0.02, 0.050), "high")[1:],
+            *stub(0.045, -0.057),
             *housing("y", (0, 0, 0), 0.045, (-0.063, 0.045), "high"),
         ],
         "upper_arm_link": [
@@ -160,15 +169,15 @@ def _arm() -> dict[str, list[Part]]:
         ],
         "forearm_link": [
             *housing("z", (0, 0, 0), 0.0375, (0.001, 0.066), "low"),
-            *tube("x", (-0.1066, 0, 0.027), 0.027, 0.2132),
+            *tube("x", (-0.1066, 0, 0.0285), 0.0265, 0.2132),
             *housing("z", (-0.2132, 0, 0), 0.032, (-0.0195, 0.0775), "low"),
         ],
         "wrist_1_link": [
-            *housing("z", (0, 0, 0), 0.032, (-0.054, 0.031), "high"),
+            *stub(0.032, -0.054),
             *housing("y", (0, 0, 0), 0.032, (-0.050, 0.046), "high"),
         ],
         "wrist_2_link": [
-            *housing("z", (0, 0, 0), 0.032, (-0.035, 0.031), "high"),
+            *stub(0.032, -0.035),
             *housing("y", (0, 0, 0), 0.032, (-0.0465, 0.0505), "low"),
         ],
         "wrist_3_link": [
@@ -180,12 +189,10 @@ def _arm() -> dict[str, list[Part]]:
 
 def _gripper_body() -> list[Part]:
     plate = lathe([(0, 0), (0.0325, 0), (0.0325, 0.006)], "z", (0, 0, 0))
-    collar = loft([(0.004, 0.0400), (0.0065, 0.0465)], BODY_HALF_DEPTH, 0.006)
     band = box((-0.0425, -BODY_HALF_DEPTH - 0.0006, 0.040), (0.0425, BODY_HALF_DEPTH + 0.0006, 0.052))
     return [
         Part(plate, GRIPPER_STEEL),
-        Part(collar, GRIPPER_STEEL),
-        Part(loft(BODY_OUTLINE, BODY_HALF_DEPTH, 0.006), GRIPPER_DARK),
+        Part(loft(BODY_OUTLINE, BODY_HALF_DEPTH, 0.011), GRIPPER_DARK),
         Part(band, GRIPPER_STEEL),
     ]
 
@@ -211,14 +218,14 @@ def _finger() -> list[Part]:
         Part(bar(INNER_PIVOT, root(INNER_PIVOT), 0.0055, 0.0108, 0.0160), GRIPPER_DARK),
         Part(bar(INNER_PIVOT, root(INNER_PIVOT), 0.0055, -0.0160, -0.0108), GRIPPER_DARK),
         Part(
-            lathe([(0, -0.0175), (0.0034, -0.0175), (0.0034, 0.0175), (0, 0.0175)], "y", (*_at(INNER_PIVOT),)),
+            lathe(
+                [(0, -0.0175), (0.0034, -0.0175), (0.0034, 0.0175), (0, 0.0175)],
+                "y",
+                (INNER_PIVOT[0], 0, INNER_PIVOT[1]),
+            ),
             GRIPPER_STEEL,
         ),
     ]
-
-
-def _at(pivot: tuple[float, float]) -> tuple[float, float, float]:
-    return (pivot[0], 0.0, pivot[1])
 
 
 def _merge(parts: Sequence[Part], color: Color) -> trimesh.Trimesh:
