@@ -7,7 +7,8 @@ from dataclasses import asdict, dataclass
 from typing import Any, Protocol
 
 import torch
-from diffusers import DDIMScheduler, DDPMScheduler
+from diffusers.schedulers.scheduling_ddim import DDIMScheduler
+from diffusers.schedulers.scheduling_ddpm import DDPMScheduler
 from torch import Tensor
 
 from manicm_ms.errors import ConfigError
@@ -137,7 +138,12 @@ class DiffusionPolicy(Policy):
         spec: the environment that it is made for.
         chunk: To, Tp, Ta.
         diffusion: noising process and sampler.
+
+    Attributes:
+        alphas_cumprod: (T,) alpha_bar at each time.
     """
+
+    alphas_cumprod: Tensor
 
     def __init__(
         self, name: str, network: ConditionedDenoiser, spec: EnvSpec, chunk: ChunkSpec, diffusion: DiffusionConfig
@@ -193,7 +199,7 @@ class DiffusionPolicy(Policy):
         x_t = noise
         for t in sampler.timesteps.tolist():
             output = self.network.denoise(x_t, torch.full((len(x_t),), t, device=x_t.device), cond).float()
-            x_t = sampler.step(output, t, x_t).prev_sample
+            x_t = sampler.step(output, t, x_t, return_dict=False)[0]
         return x_t
 
     @torch.inference_mode()

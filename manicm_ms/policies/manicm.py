@@ -8,7 +8,7 @@ from dataclasses import asdict, dataclass
 from typing import Any
 
 import torch
-from diffusers import LCMScheduler
+from diffusers.schedulers.scheduling_lcm import LCMScheduler
 from torch import Tensor
 
 from manicm_ms.errors import ConfigError
@@ -62,7 +62,13 @@ class ManiCM(Policy):
         chunk: To, Tp, Ta.
         diffusion: the teacher's noising process.
         consistency: consistency function and sampler.
+
+    Attributes:
+        alphas_cumprod: (T,) alpha_bar at each time.
+        timesteps: times that sampling visits, descending.
     """
+
+    alphas_cumprod: Tensor
 
     name = "manicm"
 

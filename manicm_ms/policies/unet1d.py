@@ -19,6 +19,8 @@ class SinusoidalEmbedding(nn.Module):
         dim: of the embedding, even.
     """
 
+    rates: Tensor
+
     def __init__(self, dim: int) -> None:
         super().__init__()
         half = dim // 2

@@ -1,0 +1,228 @@
+"""Checkpoint folders: weights, configuration, model card and a manifest by which damage is noticed.
+
+::
+
+    runs/teacher/
+      config.json          policy, its configuration, the environment's spec, To, Tp, Ta
+      model.safetensors    weights and normaliser
+      MODEL_CARD.md        what it is, what it was trained on, licence
+      manifest.json        format, SHA-256 of the other files, versions, provenance
+
+Nothing is ever unpickled.
+"""
+
+from __future__ import annotations
+
+import errno
+import json
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
+from dataclasses import asdict
+from pathlib import Path
+from typing import Any
+
+import torch
+from safetensors import SafetensorError
+from safetensors.torch import load_file, save_file
+from torch import Tensor
+
+from manicm_ms.errors import CheckpointError, ConfigError, ManicmError, NoSpaceError, OutputExistsError
+from manicm_ms.paths import replaced_folder, require_free_space, sha256, write_json, write_text
+from manicm_ms.policies.base import POLICIES, Policy
+from manicm_ms.policies.model_card import model_card
+from manicm_ms.provenance import package_versions
+from manicm_ms.types import ChunkSpec, EnvSpec
+
+FORMAT = "manicm_ms.checkpoint"
+FORMAT_VERSION = 1
+WEIGHTS_DTYPES = {"float32": torch.float32, "bfloat16": torch.bfloat16, "float16": torch.float16}
+
+_CONFIG, _MODEL, _CARD, _MANIFEST = "config.json", "model.safetensors", "MODEL_CARD.md", "manifest.json"
+_FILES = (_CONFIG, _MODEL, _CARD)
+_NORMALIZER = ".normalizer."  # in a key: ranges of the data, which stay float32 in every checkpoint
+
+
+def save_checkpoint(policy: Policy, folder: Path, provenance: Mapping[str, Any], *, dtype: str = "float32") -> None:
+    """Write `policy` to `folder`, in place of the checkpoint there, if any; a kill leaves the old or the new one.
+
+    Args:
+        policy: teacher or student.
+        folder: of the checkpoint.
+        provenance: where it comes from, JSON values: data, preset, steps, seed, command, ...
+        dtype: of the stored weights, a name in `WEIGHTS_DTYPES`; they are float32 again when loaded. float16
+            halves the file and keeps 11 significant bits. The normaliser always stays float32.
+
+    Raises:
+        CheckpointError: the policy is a wrapper that no checkpoint can hold, or its weights are not finite.
+        ConfigError: unknown dtype, or provenance that JSON cannot hold.
+        OutputExistsError: the folder holds something other than a checkpoint.
+        NoSpaceError: the disk is full; the old checkpoint stays.
+    """
+    folder = Path(folder)
+    if not policy.registered:
+        raise CheckpointError(f"{policy.name} is a wrapper around another policy: save that one")
+    if dtype not in WEIGHTS_DTYPES:
+        raise ConfigError(f"unknown checkpoint dtype {dtype!r}: use {', '.join(WEIGHTS_DTYPES)}")
+    if folder.exists() and (not folder.is_dir() or (any(folder.iterdir()) and not _is_checkpoint(folder))):
+        raise OutputExistsError(f"{folder} holds something other than a checkpoint: choose another folder")
+    tensors = _stored(policy, WEIGHTS_DTYPES[dtype])
+    require_free_space(folder, sum(t.nbytes for t in tensors.values()) + (1 << 20))
+    description = {
+        "policy": policy.name,
+        "config": policy.config_dict(),
+        "env_spec": policy.spec.to_dict(),
+        "chunk": asdict(policy.chunk),
+    }
+    with _disk_errors(folder), replaced_folder(folder) as fresh:
+        save_file(tensors, fresh / _MODEL)
+        (fresh / _MODEL).chmod(0o644)
+        write_json(fresh / _CONFIG, description)
+        write_text(fresh / _CARD, model_card(policy, _plain(provenance), dtype))
+        write_json(fresh / _MANIFEST, _manifest(fresh, policy.name, dtype, _plain(provenance)))
+
+
+def read_manifest(folder: Path) -> dict[str, Any]:
+    """Return the manifest of a checkpoint without reading its weights.
+
+    Returns:
+        `format`, `version`, `policy` (its name), `weights_dtype`, `files` (name -> `sha256`, `bytes`),
+        `packages` (name -> version), `provenance`.
+
+    Raises:
+        CheckpointError: there is no checkpoint, or one of another program or of a newer format.
+    """
+    folder = Path(folder)
+    path = folder / _MANIFEST
+    if not folder.is_dir():
+        raise CheckpointError(f"there is no checkpoint folder {folder}: train one, or check the path")
+    if not path.is_file():
+        raise CheckpointError(f"{folder} is no checkpoint of this package: it has no {_MANIFEST}")
+    manifest = _read_json(path)
+    if manifest.get("format") != FORMAT:
+        raise CheckpointError(f"{path} is of format {manifest.get('format')!r}, not {FORMAT!r}: it is foreign")
+    version = manifest.get("version")
+    if version != FORMAT_VERSION:
+        raise CheckpointError(
+            f"{path} has format version {version!r} and this package reads {FORMAT_VERSION}: "
+            "install the version of manicm_ms that wrote it"
+        )
+    if not isinstance(manifest.get("files"), dict) or set(manifest["files"]) != set(_FILES):
+        raise CheckpointError(f"{path} does not list {', '.join(_FILES)}: copy or train the checkpoint again")
+    return manifest
+
+
+def verify_checkpoint(folder: Path) -> dict[str, Any]:
+    """Return the manifest; raise CheckpointError naming the first file that is missing, truncated or altered."""
+    folder = Path(folder)
+    manifest = read_manifest(folder)
+    remedy = "copy the checkpoint again or train it anew"
+    for name in _FILES:
+        path, entry = folder / name, manifest["files"][name]
+        if not path.is_file():
+            raise CheckpointError(f"{path} is missing: {remedy}")
+        if path.stat().st_size != entry.get("bytes"):
+            raise CheckpointError(
+                f"{path} has {path.stat().st_size} bytes where the manifest says {entry.get('bytes')}: {remedy}"
+            )
+        if sha256(path) != entry.get("sha256"):
+            raise CheckpointError(f"{path} was altered after it was written (its SHA-256 differs): {remedy}")
+    return manifest
+
+
+def load_checkpoint(folder: Path, device: torch.device | str = "cpu") -> Policy:
+    """Return the policy of a checkpoint, float32, ready to act on `device`.
+
+    Raises:
+        CheckpointError: the checkpoint is missing, incomplete, altered or foreign; the message names the file.
+    """
+    folder = Path(folder)
+    verify_checkpoint(folder)
+    policy = _build(folder / _CONFIG)
+    path = folder / _MODEL
+    try:
+        tensors = load_file(path)
+    except (SafetensorError, OSError) as error:
+        raise CheckpointError(f"{path} cannot be read ({error}): copy or train the checkpoint again") from error
+    expected = policy.state_dict()
+    wrong = sorted(expected.keys() ^ tensors.keys())
+    wrong += sorted(k for k in expected.keys() & tensors.keys() if expected[k].shape != tensors[k].shape)
+    if wrong:
+        raise CheckpointError(
+            f"{path} does not fit the {policy.name} that {_CONFIG} describes ({len(wrong)} tensors differ, "
+            f"first {wrong[0]}): the files come from different checkpoints"
+        )
+    policy.load_state_dict({k: v.float() for k, v in tensors.items()})
+    return policy.to(device).eval()
+
+
+def _stored(policy: Policy, dtype: torch.dtype) -> dict[str, Tensor]:
+    tensors = {}
+    for key, value in policy.state_dict().items():
+        if not torch.isfinite(value).all():
+            raise CheckpointError(f"{key} of {policy.name} holds NaN or infinity: the training diverged, nothing saved")
+        kept = torch.float32 if _NORMALIZER in key else dtype
+        tensors[key] = value.detach().to("cpu", kept, copy=True).contiguous()
+        if not torch.isfinite(tensors[key]).all():
+            raise CheckpointError(f"{key} of {policy.name} overflows {dtype}: save with dtype 'float32' or 'bfloat16'")
+    return tensors
+
+
+def _manifest(folder: Path, policy: str, dtype: str, provenance: Mapping[str, Any]) -> dict[str, Any]:
+    files = {n: {"sha256": sha256(folder / n), "bytes": (folder / n).stat().st_size} for n in _FILES}
+    return {
+        "format": FORMAT,
+        "version": FORMAT_VERSION,
+        "policy": policy,
+        "weights_dtype": dtype,
+        "files": files,
+        "packages": package_versions(),
+        "provenance": provenance,
+    }
+
+
+def _build(path: Path) -> Policy:
+    description = _read_json(path)
+    try:
+        spec = EnvSpec.from_dict(description["env_spec"])
+        return POLICIES.get(description["policy"])(description["config"], spec, ChunkSpec(**description["chunk"]))
+    except ManicmError as error:
+        raise CheckpointError(f"{path} describes no policy that this version can build: {error}") from error
+    except (KeyError, TypeError, ValueError, AttributeError) as error:
+        raise CheckpointError(f"{path} is not a checkpoint's configuration ({error!r}): train it anew") from error
+
+
+def _is_checkpoint(folder: Path) -> bool:
+    try:
+        return _read_json(folder / _MANIFEST).get("format") == FORMAT
+    except (CheckpointError, OSError):
+        return False
+
+
+def _read_json(path: Path) -> dict[str, Any]:
+    try:
+        value = json.loads(path.read_text(encoding="utf-8"))
+    except ValueError as error:
+        raise CheckpointError(f"{path} is not JSON ({error}): copy or train the checkpoint again") from error
+    if not isinstance(value, dict):
+        raise CheckpointError(f"{path} holds no JSON object: copy or train the checkpoint again")
+    return value
+
+
+def _plain(provenance: Mapping[str, Any]) -> dict[str, Any]:
+    try:
+        return json.loads(json.dumps(provenance, allow_nan=False))
+    except (TypeError, ValueError) as error:
+        raise ConfigError(f"provenance must be JSON values: {error}") from error
+
+
+@contextmanager
+def _disk_errors(folder: Path) -> Iterator[None]:
+    try:
+        yield
+    except (OSError, SafetensorError) as error:
+        full = getattr(error, "errno", None) in (errno.ENOSPC, errno.EDQUOT) or "No space left" in str(error)
+        if not full:
+            raise
+        raise NoSpaceError(
+            f"no space left for the checkpoint {folder}; nothing was changed: free some space and save again"
+        ) from error

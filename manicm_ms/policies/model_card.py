@@ -1,0 +1,67 @@
+"""The model card of a checkpoint, generated from what is known about it."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+from manicm_ms.policies.base import POLICIES, Policy
+
+LICENSE = "MIT"
+
+_TITLES = {"teacher": "diffusion teacher", "student": "consistency student"}
+
+
+def model_card(policy: Policy, provenance: Mapping[str, Any], dtype: str) -> str:
+    """Return the Markdown text that stands beside the weights of `policy`.
+
+    Args:
+        policy: what is described.
+        provenance: JSON values, each shown as given.
+        dtype: of the stored weights.
+    """
+    spec, chunk = policy.spec, policy.chunk
+    role = next((_TITLES[t] for t in _TITLES if t in POLICIES.tags(policy.name)), "policy")
+    parameters = sum(p.numel() for p in policy.parameters())
+    channels = {3: "x, y, z", 6: "x, y, z, r, g, b"}[spec.obs.point_channels]
+    lines = [
+        "---",
+        f"license: {LICENSE.lower()}",
+        "library_name: manicm_ms",
+        "tags: [robotics, imitation-learning, point-cloud]",
+        "---",
+        f"# {policy.name} for {spec.env_id}",
+        "",
+        f"A {role} that maps point clouds to action chunks, written by manicm_ms.",
+        "",
+        "| | |",
+        "|---|---|",
+        f"| Parameters | {parameters:,}, stored as {dtype} |",
+        f"| Network evaluations a decision | {policy.nfe} |",
+        f"| Reads | {chunk.n_obs_steps} frames: clouds of {channels} (metres, frame `{spec.obs.frame}`), "
+        f"agent_pos of {spec.obs.agent_pos_dim} |",
+        f"| Predicts | {chunk.horizon} actions, of which {chunk.n_action_steps} are executed |",
+        f"| Action | {', '.join(spec.action.names)}; normalised to [-1, 1] |",
+        f"| Control | `{spec.action.control_mode}` at {spec.action.control_hz:g} Hz |",
+        f"| Licence | {LICENSE} |",
+        "",
+        "## Where it comes from",
+        "",
+        *_bullets(provenance),
+        "",
+        "## Limits",
+        "",
+        f"Made for {spec.env_id} in simulation, from scripted demonstrations. Its success rate belongs in a report "
+        "with seeds and an interval; other tasks, cameras and real robots are untested.",
+    ]
+    return "\n".join(lines) + "\n"
+
+
+def _bullets(values: Mapping[str, Any], indent: str = "") -> list[str]:
+    lines = []
+    for key, value in values.items():
+        if isinstance(value, Mapping):
+            lines += [f"{indent}- {key}:", *_bullets(value, indent + "  ")]
+        else:
+            lines.append(f"{indent}- {key}: {value}")
+    return lines or [f"{indent}- not recorded"]
