@@ -1,0 +1,312 @@
+"""The command line: `manicm-ms COMMAND`; each command imports only what it needs.
+
+What a user can cause ends in one line on standard error and exit status 2. Commands that do long work go on where they
+were stopped when the same command is given again.
+"""
+
+from __future__ import annotations
+
+import errno
+import shlex
+import sys
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+import tyro
+
+from manicm_ms.errors import ManicmError, UnknownNameError
+
+Backend = Literal["auto", "cpu", "gpu"]
+Command = Callable[..., int | None]
+PROGRAM = "manicm-ms"
+USER_ERROR, INTERRUPTED = 2, 130
+PRESETS_DEFAULT = "quick"
+
+
+def list_command(kind: tyro.conf.Positional[Literal["envs", "policies", "presets"]], tag: str | None = None) -> None:
+    """List what is registered: environments, policies or training presets.
+
+    Args:
+        kind: what to list.
+        tag: only the environments that carry this tag.
+    """
+    from rich.console import Console
+
+    from manicm_ms import listing
+
+    tables = {"envs": lambda: listing.envs(tag), "policies": listing.policies, "presets": listing.presets}
+    Console().print(tables[kind]())
+
+
+def check_command(env_ids: tyro.conf.Positional[tuple[str, ...]], backend: Backend = "auto") -> int:
+    """Check that environments keep the promises of the vector interface; exit status 1 where one is broken.
+
+    Args:
+        env_ids: environment ids.
+        backend: where to simulate.
+    """
+    from manicm_ms.envs.conformance import Property, check_vec_env
+
+    def show(result: Property) -> None:
+        print(f"  {'ok  ' if result.passed else 'FAIL'} {result.name}{result.detail and ': ' + result.detail}")
+
+    broken = 0
+    for env_id in _at_least_one(env_ids, "environment id"):
+        print(env_id, flush=True)
+        broken += sum(not result.passed for result in check_vec_env(env_id, backend, on_result=show))
+    return 1 if broken else 0
+
+
+def collect_command(
+    env_id: tyro.conf.Positional[str],
+    out: Path,
+    episodes: int = 10,
+    num_envs: int | None = None,
+    seed: int = 0,
+    style: str | None = None,
+    backend: Backend = "auto",
+    colors: bool = False,
+    extras: tuple[str, ...] = (),
+) -> None:
+    """Collect demonstrations of the task's expert into a store, in parallel; the same command goes on after a kill.
+
+    Args:
+        env_id: environment id.
+        out: the store, a folder, by custom called something.zarr.
+        episodes: solved episodes wanted.
+        num_envs: environments that play at once; by default one a core. The data does not depend on it.
+        seed: first seed; seeds count up from it.
+        style: style of the expert, its default one if not given.
+        backend: where to simulate.
+        colors: store rgb beside xyz.
+        extras: optional fields to store: img, depth.
+    """
+    from manicm_ms.demos.collect import collect
+    from manicm_ms.envs.vec_env import default_num_envs
+
+    done = collect(
+        env_id, episodes, out, num_envs=num_envs or default_num_envs(), seed=seed, style=style, backend=backend,
+        colors=colors, extras=extras,
+    )  # fmt: skip
+    print(f"{done.path}: {done.episodes} episodes from {done.attempts} attempts, {done.added} of them new")
+
+
+def inspect_command(
+    store: tyro.conf.Positional[Path],
+    html: Path | None = None,
+    json: bool = False,
+) -> int:
+    """Summarise a store of demonstrations and name its problems; exit status 1 where there are any.
+
+    Args:
+        store: the store.
+        html: where to write a page with a turnable point cloud; by default beside the store.
+        json: print the summary as JSON and write no page.
+    """
+    from manicm_ms.demos.inspect import inspect
+
+    page = None if json else html or store.with_suffix(".html")
+    return inspect(store, html=page, as_json=json)
+
+
+def evaluate_command(
+    checkpoints: tyro.conf.Positional[tuple[Path, ...]],
+    env: str,
+    out: Path = Path("runs/report"),
+    episodes: int = 100,
+    seed: int = 100_000,
+    num_envs: int | None = None,
+    backend: Backend = "auto",
+    device: str = "cpu",
+    control: bool = True,
+    videos: int = 4,
+    threads: int = 1,
+) -> None:
+    """Judge checkpoints on the same fresh seeds: success with intervals, paired difference, decision latency, report.
+
+    Args:
+        checkpoints: checkpoint folders, the teacher first and the student last.
+        env: environment id.
+        out: folder of results.json, report.md and report.html.
+        episodes: fresh seeds, each played once by each policy.
+        seed: first of them.
+        num_envs: environments that play at once; by default one a core.
+        backend: where to simulate.
+        device: torch device of the policies.
+        control: add the teacher run in one step, without distillation.
+        videos: seeds filmed.
+        threads: torch threads while latency is measured.
+    """
+    from manicm_ms.evaluation.judge import evaluate
+
+    evaluate(
+        _at_least_one(checkpoints, "checkpoint folder"), env, episodes, seed, out, num_envs=num_envs, backend=backend,
+        device=device, control=control, videos=videos, threads=threads, command=_this_command(),
+    )  # fmt: skip
+
+
+def doctor_command() -> int:
+    """Say what this machine offers and lacks, each trouble with its remedy; exit status 1 where one is fatal."""
+    from manicm_ms.doctor import doctor
+
+    return doctor()
+
+
+def train_command() -> Command:
+    """Train a diffusion teacher on demonstrations; the same command goes on after Ctrl-C or a kill."""
+    from manicm_ms.policies.base import POLICIES
+    from manicm_ms.training.presets import TEACHER_PRESETS, TeacherPreset
+    from manicm_ms.training.teacher import train_teacher
+
+    default = TEACHER_PRESETS.get(_preset_asked())
+
+    def train(
+        policy: tyro.conf.Positional[str],
+        data: Path,
+        out: Path,
+        recipe: Annotated[TeacherPreset, tyro.conf.arg(name="")] = default,
+        preset: str = PRESETS_DEFAULT,
+        device: str = "auto",
+        seed: int = 0,
+    ) -> None:
+        POLICIES.get(policy)
+        train_teacher(policy, data, out, recipe, device=device, precision=recipe.precision, seed=seed)
+
+    return _documented(
+        train,
+        train_command,
+        {
+            "policy": "dp3 or simple_dp3.",
+            "data": "store of demonstrations.",
+            "out": "checkpoint folder to write.",
+            "recipe": "the preset's fields; each can be overridden.",
+            "preset": f"recipe to start from: {', '.join(TEACHER_PRESETS.names())}.",
+            "device": "torch device; auto takes an accelerator where there is one.",
+            "seed": "of weights, batches and noise.",
+        },
+    )
+
+
+def distill_command() -> Command:
+    """Distil a teacher into a one-step ManiCM student; the same command goes on after Ctrl-C or a kill."""
+    from manicm_ms.training.presets import STUDENT_PRESETS, StudentPreset
+    from manicm_ms.training.student import distill as distill_student
+
+    default = STUDENT_PRESETS.get(_preset_asked())
+
+    def distill(
+        teacher: Path,
+        data: Path,
+        out: Path,
+        recipe: Annotated[StudentPreset, tyro.conf.arg(name="")] = default,
+        preset: str = PRESETS_DEFAULT,
+        device: str = "auto",
+        seed: int = 0,
+    ) -> None:
+        distill_student(teacher, data, out, recipe, device=device, precision=recipe.precision, seed=seed)
+
+    return _documented(
+        distill,
+        distill_command,
+        {
+            "teacher": "checkpoint folder of the teacher.",
+            "data": "the store that the teacher was trained on.",
+            "out": "checkpoint folder to write.",
+            "recipe": "the preset's fields; each can be overridden.",
+            "preset": f"recipe to start from: {', '.join(STUDENT_PRESETS.names())}.",
+            "device": "torch device; auto takes an accelerator where there is one.",
+            "seed": "of batches and noise.",
+        },
+    )
+
+
+_PLAIN: dict[str, Command] = {
+    "list": list_command,
+    "check": check_command,
+    "collect": collect_command,
+    "inspect": inspect_command,
+    "evaluate": evaluate_command,
+    "doctor": doctor_command,
+}
+# These depend on the preset that the command line names: its fields become options with its values as defaults.
+_WITH_PRESET: dict[str, Callable[[], Command]] = {"train": train_command, "distill": distill_command}
+
+
+def main(arguments: Sequence[str] | None = None) -> None:
+    """Run one command and exit with its status: 0 good, 1 a check failed, 2 a user error, 130 stopped by Ctrl-C."""
+    arguments = list(sys.argv[1:] if arguments is None else arguments)
+    try:
+        code = _run(arguments)
+    except ManicmError as error:
+        code = _complain(str(error))
+    except OSError as error:
+        if error.errno not in (errno.ENOSPC, errno.EDQUOT):
+            raise
+        code = _complain(
+            f"no space left on the disk ({error.filename or 'output'}): free some and give the same command"
+        )
+    except KeyboardInterrupt:
+        print("stopped; the same command goes on from here", file=sys.stderr)
+        code = INTERRUPTED
+    sys.exit(code or 0)
+
+
+def _run(arguments: list[str]) -> int | None:
+    if not arguments or arguments[0] in ("-h", "--help"):
+        _overview()
+        return 0 if arguments else USER_ERROR
+    if arguments[0] == "--version":
+        from manicm_ms import __version__
+
+        print(__version__)
+        return 0
+    name, rest = arguments[0], arguments[1:]
+    known = {**_PLAIN, **_WITH_PRESET}
+    if name not in known:
+        raise UnknownNameError("command", name, known)
+    command = _WITH_PRESET[name]() if name in _WITH_PRESET else _PLAIN[name]
+    return tyro.cli(command, prog=f"{PROGRAM} {name}", args=rest, config=(tyro.conf.OmitArgPrefixes,))
+
+
+def _overview() -> None:
+    print(f"usage: {PROGRAM} COMMAND ...   ('{PROGRAM} COMMAND --help' tells more)\n")
+    for name, command in {**_PLAIN, **_WITH_PRESET}.items():
+        print(f"  {name:<9} {(command.__doc__ or '').splitlines()[0]}")
+
+
+def _complain(message: str) -> int:
+    print(f"{PROGRAM}: {' '.join(message.split())}", file=sys.stderr)
+    return USER_ERROR
+
+
+def _preset_asked() -> str:
+    """Return the preset that the command line names: known before parsing, because the options depend on it."""
+    words = sys.argv[1:]
+    for k, word in enumerate(words):
+        if word == "--preset" and k + 1 < len(words):
+            return words[k + 1]
+        if word.startswith("--preset="):
+            return word.removeprefix("--preset=")
+    return PRESETS_DEFAULT
+
+
+def _documented(command: Command, source: Callable[..., Any], arguments: dict[str, str]) -> Command:
+    """Give `command` the docstring of `source` and a description of each argument, in the form that tyro reads."""
+    lines = [f"    {name}: {text}" for name, text in arguments.items()]
+    command.__doc__ = "\n".join([(source.__doc__ or "").strip(), "", "Args:", *lines])
+    return command
+
+
+def _at_least_one(values: tuple[Any, ...], what: str) -> tuple[Any, ...]:
+    if not values:
+        raise ManicmError(f"name at least one {what}")
+    return values
+
+
+def _this_command() -> str:
+    return shlex.join([PROGRAM, *sys.argv[1:]])
+
+
+if __name__ == "__main__":
+    main()
