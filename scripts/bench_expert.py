@@ -1,6 +1,6 @@
 """Plays a task's expert over many seeds and measures success, length, speed, smoothness and push force.
 
-    python scripts/bench_expert.py --env ur3e/slide-block --episodes 200 --write
+python scripts/bench_expert.py --env ur3e/slide-block --episodes 200 --write
 """
 
 from __future__ import annotations

@@ -66,8 +66,8 @@ class Waypoints:
 class WaypointFollower:
     """Turns the present state into the next action, row by row independent.
 
-    The speed along a line follows a trapezoid, limited so that the tool can always stop at the way-point:
-    v <= sqrt(2 a d). Planning uses the controller's target, which runs ahead of the arm; arrival uses both.
+    The speed along a line follows a trapezoid, limited so that the tool can always stop at the way-point without
+    overshoot. Planning uses the controller's target, which runs ahead of the arm; arrival uses both.
 
     Args:
         spec: names the parts of the privileged state (tcp_pose, tcp_target_pose).
@@ -137,14 +137,11 @@ class WaypointFollower:
         """Return how far the target moves in this control step, (N, 3) m, towards `offset` (N, 3)."""
         dt, most = 1 / self._motion.control_hz, self._motion.acceleration
         distance = offset.norm(dim=1)
-        stop = torch.sqrt(2 * most * distance)
-        wanted = torch.minimum(torch.minimum(speed, stop), distance / dt)
+        wanted = torch.minimum(speed, stopping_speed(distance, most, dt))
         velocity = offset / distance.clamp(min=1e-9)[:, None] * wanted[:, None]
         change = velocity - self._velocity
         size = change.norm(dim=1)
-        # The last stretch may brake harder than `acceleration` by a rounding of one control step.
-        allowed = torch.where(distance / dt <= most * dt, size, most * dt)
-        self._velocity = self._velocity + change * (allowed / size.clamp(min=1e-9)).clamp(max=1)[:, None]
+        self._velocity = self._velocity + change * (most * dt / size.clamp(min=1e-9)).clamp(max=1)[:, None]
         return self._velocity * dt
 
     def _turn(self, yaw: Tensor) -> Tensor:
@@ -152,6 +149,18 @@ class WaypointFollower:
         turn = (yaw - self._yaw).clamp(-most, most)
         self._yaw = self._yaw + turn
         return turn
+
+
+def stopping_speed(distance: Tensor, deceleration: float, dt: float) -> Tensor:
+    """Return the largest speed (N,) m/s of this control step from which the tool stops at `distance` (N,) m.
+
+    In control steps of `dt` s the continuous v = sqrt(2 a d) overshoots: the first step is played before any braking.
+    With v = a dt (n + r), 0 <= r < 1, this step and the n braking ones after it cover
+    d = a dt^2 (n + 1) (n / 2 + r); solved for v that is v = a dt (d / (a dt^2) / (n + 1) + n / 2).
+    """
+    units = distance / (deceleration * dt * dt)
+    braking = torch.floor((torch.sqrt(1 + 8 * units) - 1) / 2)
+    return (units / (braking + 1) + braking / 2) * (deceleration * dt)
 
 
 def waypoint_table(
