@@ -1,0 +1,440 @@
+"""Evaluate a teacher and its student on the same fresh seeds: roll-outs, control, latency, videos, report."""
+
+from __future__ import annotations
+
+import json
+import re
+import shlex
+from collections.abc import Callable, Mapping, Sequence
+from contextlib import ExitStack
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+from rich.console import Console
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
+
+from manicm_ms.errors import ConfigError, ManicmError
+from manicm_ms.evaluation.latency import Latency, measure_latency
+from manicm_ms.evaluation.machine import machine
+from manicm_ms.evaluation.records import EpisodeLog, claimed_folder
+from manicm_ms.evaluation.report import summary_table, write_report
+from manicm_ms.evaluation.rollout import EpisodeResult, RestartableEnv, rollout
+from manicm_ms.evaluation.statistics import compare_paired, success_rate
+from manicm_ms.evaluation.video import Take, choose_seeds, film
+from manicm_ms.paths import sha256, write_json
+from manicm_ms.provenance import package_versions
+from manicm_ms.types import AGENT_POS, ChunkSpec, EnvSpec, require_compatible
+
+if TYPE_CHECKING:
+    from manicm_ms.envs.vec_env import VecEnv
+    from manicm_ms.policies.base import Policy
+
+TEACHER, CONTROL, STUDENT = "teacher", "control", "student"
+SCHEMA_VERSION = 1
+
+
+@dataclass(frozen=True)
+class Contender:
+    """A policy to be judged.
+
+    Attributes:
+        name: its name in tables and files, unique among the contenders.
+        role: "teacher", "control" or "student".
+        checkpoint: folder it was loaded from, as the caller named it.
+        policy: the policy itself, on the device it shall run on.
+    """
+
+    name: str
+    role: str
+    checkpoint: str
+    policy: Policy
+
+
+@dataclass(frozen=True)
+class Protocol:
+    """What is fixed about an evaluation beside its contenders.
+
+    Attributes:
+        env_id: the environment.
+        seeds: one episode each.
+        num_envs: rows that run in parallel; does not change the conditions of an episode.
+        threads: torch's intra-op threads while latency is measured.
+        repetitions: timed decisions per policy.
+        videos: seeds filmed, for each of teacher and student.
+    """
+
+    env_id: str
+    seeds: tuple[int, ...]
+    num_envs: int
+    threads: int = 1
+    repetitions: int = 50
+    videos: int = 4
+
+    def __post_init__(self) -> None:
+        if not self.seeds:
+            raise ConfigError("an evaluation needs at least one episode")
+        if min(self.num_envs, self.threads, self.repetitions) < 1 or self.videos < 0:
+            raise ConfigError(f"num_envs, threads and repetitions must be at least 1 and videos at least 0, got {self}")
+
+
+class EnvMaker(NamedTuple):
+    """Makes the vector envs that an evaluation needs.
+
+    Attributes:
+        for_policy: (policy, num_envs) -> env that exchanges histories and chunks as the policy does.
+        for_film: (num_envs) -> env without a chunk, with `render_video_frames`.
+    """
+
+    for_policy: Callable[[Policy, int], VecEnv]
+    for_film: Callable[[int], VecEnv]
+
+
+def evaluate(
+    checkpoints: Sequence[Path],
+    env_id: str,
+    episodes: int,
+    seed: int,
+    out: Path,
+    *,
+    num_envs: int | None = None,
+    backend: str = "auto",
+    device: str = "cpu",
+    control: bool = True,
+    videos: int = 4,
+    threads: int = 1,
+    repetitions: int = 50,
+    command: str | None = None,
+    console: Console | None = None,
+) -> dict[str, Any]:
+    """Judge checkpoints on the same `episodes` fresh seeds and write results.json, report.md and report.html.
+
+    The same call goes on where an earlier one was stopped, by Ctrl-C or by a kill: finished episodes are
+    on disk and are not played again.
+
+    Args:
+        checkpoints: checkpoint folders, the teacher first and the student last; one alone is judged without a pair.
+        env_id: environment, for example "ur3e/slide-block".
+        episodes: seeds seed, seed + 1, ..., seed + episodes - 1.
+        seed: the first seed; choose it beyond those of the demonstrations.
+        out: folder of records and report.
+        num_envs: rows in parallel; None takes the machine's cores.
+        backend: of `make_vec`.
+        device: torch device of the policies.
+        control: add the teacher run in one step, without distillation, between teacher and student.
+        videos: seeds filmed for teacher and student.
+        threads: torch threads while latency is measured.
+        repetitions: timed decisions per policy.
+        command: the command line to print in the report; None writes the equivalent of this call.
+        console: where progress and table are printed; None is standard output.
+
+    Returns:
+        What results.json holds.
+
+    Raises:
+        UnknownNameError, CheckpointError, SpecMismatchError, ConfigError, OutputExistsError, NoSpaceError,
+        BackendError.
+    """
+    from manicm_ms.envs.vec_env import default_num_envs, make_vec, resolve_backend
+
+    if episodes < 1:
+        raise ConfigError(f"--episodes must be at least 1, got {episodes}")
+    rows = min(num_envs or default_num_envs(), episodes)
+    protocol = Protocol(env_id, tuple(range(seed, seed + episodes)), rows, threads, repetitions, videos)
+    contenders = load_contenders(checkpoints, device, control)
+    backend = resolve_backend(backend)
+
+    def for_policy(policy: Policy, n: int) -> VecEnv:
+        obs = policy.spec.obs
+        return make_vec(
+            env_id, n, backend, chunk=policy.chunk, num_points=obs.num_points, colors=obs.point_channels == 6
+        )
+
+    def for_film(n: int) -> VecEnv:
+        return make_vec(env_id, n, backend, obs=(AGENT_POS,), video=True)
+
+    request = {
+        "env_id": env_id,
+        "seed": seed,
+        "episodes": episodes,
+        "backend": backend,
+        "device": device,
+        "policies": [[c.name, c.role, checkpoint_digest(c.checkpoint)] for c in contenders],
+    }
+    command = command or _command(checkpoints, env_id, episodes, seed, out)
+    return judge(contenders, protocol, EnvMaker(for_policy, for_film), out, request, command, console or Console())
+
+
+def load_contenders(checkpoints: Sequence[Path], device: str = "cpu", control: bool = True) -> list[Contender]:
+    """Load the checkpoints, the first as teacher and the others as students, with the control row where asked.
+
+    Names are the folders' names, with their parents' where two are alike.
+    """
+    from manicm_ms.policies.checkpoint import load_checkpoint
+    from manicm_ms.policies.diffusion import DiffusionPolicy, OneStepTeacher
+
+    if not checkpoints:
+        raise ConfigError("name at least one checkpoint folder")
+    paths = [Path(p) for p in checkpoints]
+    names = [p.resolve().name for p in paths]
+    if len(set(names)) < len(names):
+        names = [f"{p.resolve().parent.name}/{p.resolve().name}" for p in paths]
+    if len(set(names)) < len(names):
+        raise ConfigError(f"two checkpoints have one name ({', '.join(names)}): judge different ones")
+    policies = [load_checkpoint(p, device=device) for p in paths]
+    contenders = [
+        Contender(name, TEACHER if i == 0 else STUDENT, str(path), policy)
+        for i, (name, path, policy) in enumerate(zip(names, paths, policies, strict=True))
+    ]
+    first = contenders[0]
+    if control and isinstance(first.policy, DiffusionPolicy):
+        one_step = OneStepTeacher(first.policy)
+        contenders.insert(1, Contender(f"{first.name}, one step", CONTROL, first.checkpoint, one_step))
+    return contenders
+
+
+def checkpoint_digest(folder: str) -> str:
+    """Return what tells this checkpoint from another one under the same path: its manifest's SHA-256."""
+    return sha256(Path(folder) / "manifest.json")
+
+
+def judge(
+    contenders: Sequence[Contender],
+    protocol: Protocol,
+    envs: EnvMaker,
+    out: Path,
+    request: Mapping[str, Any],
+    command: str,
+    console: Console,
+) -> dict[str, Any]:
+    """Judge loaded policies; see `evaluate`, which loads them and makes real environments.
+
+    Args:
+        contenders: teacher first, student last.
+        protocol: seeds and sizes.
+        envs: makes the vector envs.
+        out: folder of records and report.
+        request: plain JSON values that identify this evaluation in `out`.
+        command: the command line that reproduces it.
+        console: where progress and table are printed.
+    """
+    with claimed_folder(out, request):
+        latencies = _latencies(contenders, protocol, out / "latency.json")
+        episodes, spec = _play(contenders, protocol, envs, out, console)
+        results = compile_results(contenders, protocol, episodes, latencies, command)
+        results["success_rule"] = spec.success_rule
+        results["videos"] = _film(contenders, protocol, envs, out, episodes, spec, console)
+        write_json(out / "results.json", results)
+        write_report(results, out)
+    console.print(summary_table(results))
+    console.print(f"report: {out / 'report.html'}", soft_wrap=True)
+    return results
+
+
+def compile_results(
+    contenders: Sequence[Contender],
+    protocol: Protocol,
+    episodes: Mapping[str, Sequence[EpisodeResult]],
+    latencies: Mapping[str, Latency],
+    command: str,
+) -> dict[str, Any]:
+    """Return the content of results.json; every count in it is derived from the per-episode records here."""
+    policies = [_policy_entry(c, episodes[c.name], latencies[c.name]) for c in contenders]
+    return {
+        "schema_version": SCHEMA_VERSION,
+        "env_id": protocol.env_id,
+        "seeds": list(protocol.seeds),
+        "command": command,
+        "versions": package_versions(),
+        "machine": machine(),
+        "num_envs": protocol.num_envs,
+        "policies": policies,
+        "paired": _paired_entry(contenders[0], contenders[-1], episodes) if len(contenders) > 1 else None,
+    }
+
+
+def _policy_entry(contender: Contender, episodes: Sequence[EpisodeResult], latency: Latency) -> dict[str, Any]:
+    rate = success_rate([e.success for e in episodes])
+    return {
+        "name": contender.name,
+        "role": contender.role,
+        "checkpoint": contender.checkpoint,
+        "nfe": contender.policy.nfe,
+        "n": rate.n,
+        "successes": rate.successes,
+        "success_rate": rate.rate,
+        "ci95": list(rate.ci95),
+        "crashed": sum(e.crashed is not None for e in episodes),
+        "latency_ms": {"median": latency.median_ms, "p95": latency.p95_ms, "n": latency.n},
+        "device": latency.device,
+        "threads": latency.threads,
+        "dtype": latency.dtype,
+        "parameters": sum(p.numel() for p in contender.policy.parameters()),
+        "episodes": [e.summary() for e in episodes],
+    }
+
+
+def _paired_entry(
+    first: Contender, second: Contender, episodes: Mapping[str, Sequence[EpisodeResult]]
+) -> dict[str, Any]:
+    pair = compare_paired(
+        [e.success for e in episodes[first.name]],
+        [e.success for e in episodes[second.name]],
+    )
+    return {
+        "first": first.name,
+        "second": second.name,
+        **pair.counts._asdict(),
+        "difference": pair.difference,
+        "difference_is": "success rate of the second minus that of the first",
+        "difference_ci95": list(pair.difference_ci95),
+        "mcnemar_p": pair.mcnemar_p,
+    }
+
+
+def _latencies(contenders: Sequence[Contender], protocol: Protocol, path: Path) -> dict[str, Latency]:
+    """Measure each contender, or read what an earlier call of the same evaluation measured.
+
+    Before any worker process exists, so that the machine is quiet.
+    """
+    if path.exists():
+        stored = {name: Latency(**fields) for name, fields in json.loads(path.read_text(encoding="utf-8")).items()}
+        wanted = (protocol.threads, protocol.repetitions)
+        if set(stored) == {c.name for c in contenders} and all((s.threads, s.n) == wanted for s in stored.values()):
+            return stored
+    measured = measure_latency(
+        {c.name: c.policy for c in contenders}, repetitions=protocol.repetitions, threads=protocol.threads
+    )
+    write_json(path, {name: latency._asdict() for name, latency in measured.items()})
+    return measured
+
+
+def _play(
+    contenders: Sequence[Contender], protocol: Protocol, envs: EnvMaker, out: Path, console: Console
+) -> tuple[dict[str, list[EpisodeResult]], EnvSpec]:
+    """Play what is not yet on disk; return each contender's results in the order of the seeds, and the env's spec."""
+    results: dict[str, list[EpisodeResult]] = {}
+    with ExitStack() as stack:
+        bench = stack.enter_context(_Bench(envs, protocol))
+        progress = stack.enter_context(_progress(console))
+        for contender in contenders:
+            log = stack.enter_context(EpisodeLog(out / "episodes" / f"{slug(contender.name)}.jsonl"))
+            missing = [s for s in protocol.seeds if s not in log]
+            done = len(protocol.seeds) - len(missing)
+            bar = progress.add_task(contender.name, total=len(protocol.seeds), completed=done, successes="")
+            if missing:
+                home = bench.home(contender)
+                rollout(home, contender.policy, missing, on_episode=_recorder(log, progress, bar))
+            results[contender.name] = [log[s] for s in protocol.seeds]
+            progress.update(bar, successes=f"{sum(e.success for e in results[contender.name])} successes")
+        return results, bench.spec or contenders[0].policy.spec
+
+
+def _recorder(log: EpisodeLog, progress: Progress, bar: Any) -> Callable[[EpisodeResult], None]:
+    successes = 0
+
+    def record(result: EpisodeResult) -> None:
+        nonlocal successes
+        log.append(result)
+        successes += result.success
+        progress.update(bar, advance=1, successes=f"{successes} successes")
+
+    return record
+
+
+class _Bench:
+    """Keeps one vector env alive across contenders that exchange the same chunks: workers start slowly."""
+
+    def __init__(self, envs: EnvMaker, protocol: Protocol) -> None:
+        self._envs, self._protocol = envs, protocol
+        self._home: RestartableEnv | None = None
+        self._shape: tuple[int, ...] = ()
+        self.spec: EnvSpec | None = None
+
+    def home(self, contender: Contender) -> RestartableEnv:
+        policy = contender.policy
+        shape = _exchange(policy.chunk, policy.spec)
+        if self._home is None or shape != self._shape:
+            self._close()
+            self._home = RestartableEnv(lambda: self._envs.for_policy(policy, self._protocol.num_envs))
+            self._shape = shape
+        self.spec = self._home.env.env_spec
+        env_name = f"environment {self.spec.env_id}"
+        require_compatible(self.spec, policy.spec, env_name, f"checkpoint {contender.checkpoint}")
+        return self._home
+
+    def _close(self) -> None:
+        if self._home is not None:
+            self._home.close()
+            self._home = None
+
+    def __enter__(self) -> _Bench:
+        return self
+
+    def __exit__(self, *exc: object) -> None:
+        self._close()
+
+
+def _exchange(chunk: ChunkSpec, spec: EnvSpec) -> tuple[int, ...]:
+    return (chunk.n_obs_steps, chunk.n_action_steps, spec.obs.num_points, spec.obs.point_channels)
+
+
+def _film(
+    contenders: Sequence[Contender],
+    protocol: Protocol,
+    envs: EnvMaker,
+    out: Path,
+    episodes: Mapping[str, Sequence[EpisodeResult]],
+    spec: EnvSpec,
+    console: Console,
+) -> list[dict[str, Any]]:
+    """Film teacher and student on the same seeds; return what was filmed, with the files relative to `out`."""
+    cast = [contenders[0], contenders[-1]] if len(contenders) > 1 else [contenders[0]]
+    seeds = choose_seeds(episodes[cast[0].name], episodes[cast[-1].name], protocol.videos)
+    scenes = [(seed, contender) for seed in seeds for contender in cast]
+    by_seed = {c.name: {e.seed: e for e in episodes[c.name]} for c in cast}
+    entries, takes = [], []
+    for seed, contender in scenes:
+        file = f"videos/{slug(contender.name)}-{seed}.mp4"
+        episode = by_seed[contender.name][seed]
+        entries.append({"seed": seed, "policy": contender.name, "success": episode.success, "file": file})
+        if not (out / file).exists():
+            takes.append(Take(episode, out / file))
+    if not takes:
+        return entries
+    try:
+        with _progress(console) as progress:
+            bar = progress.add_task("videos", total=len(takes), successes="")
+            vec_env = envs.for_film(min(protocol.num_envs, len(takes)))
+            try:
+                for take, success in film(vec_env, takes, spec.action.control_hz):
+                    progress.update(bar, advance=1)
+                    if success != take.episode.success:  # a simulation that does not repeat itself
+                        take.path.unlink()
+            finally:
+                vec_env.close()
+    except ManicmError as error:  # a report without pictures is better than none
+        console.print(f"[yellow]no videos: {error}[/]")
+    return [entry for entry in entries if (out / str(entry["file"])).exists()]
+
+
+def _progress(console: Console) -> Progress:
+    return Progress(
+        TextColumn("{task.description}"),
+        BarColumn(),
+        MofNCompleteColumn(),
+        TextColumn("{task.fields[successes]}"),
+        TimeElapsedColumn(),
+        TimeRemainingColumn(),
+        console=console,
+    )
+
+
+def slug(name: str) -> str:
+    """Return `name` as a file name."""
+    return re.sub(r"[^\w-]+", "-", name).strip("-")
+
+
+def _command(checkpoints: Sequence[Path], env_id: str, episodes: int, seed: int, out: Path) -> str:
+    words = ["manicm-ms", "evaluate", *map(str, checkpoints), "--env", env_id]
+    return shlex.join([*words, "--episodes", str(episodes), "--seed", str(seed), "--out", str(out)])

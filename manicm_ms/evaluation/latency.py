@@ -1,0 +1,133 @@
+"""Wall time of one decision: observation in, action out, measured apart from any roll-out."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
+from typing import TYPE_CHECKING, NamedTuple
+
+import numpy as np
+import torch
+
+from manicm_ms.errors import ConfigError
+from manicm_ms.types import AGENT_POS, POINT_CLOUD, ChunkSpec, EnvSpec
+
+if TYPE_CHECKING:
+    from manicm_ms.policies.base import Policy
+
+
+class Latency(NamedTuple):
+    """How long one decision takes.
+
+    Attributes:
+        median_ms: median wall time, milliseconds.
+        p95_ms: 95th percentile, milliseconds.
+        n: timed decisions.
+        nfe: network evaluations per decision.
+        threads: torch's intra-op threads.
+        dtype: dtype of the parameters, for example "float32".
+        device: "cpu" or the name of the CUDA device.
+    """
+
+    median_ms: float
+    p95_ms: float
+    n: int
+    nfe: int
+    threads: int
+    dtype: str
+    device: str
+
+
+def example_observation(spec: EnvSpec, chunk: ChunkSpec, seed: int = 0) -> dict[str, torch.Tensor]:
+    """Return one observation of the right shapes on the CPU: point_cloud (1, To, P, C), agent_pos (1, To, D).
+
+    Values are uniform in [0, 1): a decision takes the same operations whatever they are.
+    """
+    generator = torch.Generator().manual_seed(seed)
+    frames = (1, chunk.n_obs_steps)
+    return {
+        POINT_CLOUD: torch.rand((*frames, spec.obs.num_points, spec.obs.point_channels), generator=generator),
+        AGENT_POS: torch.rand((*frames, spec.obs.agent_pos_dim), generator=generator),
+    }
+
+
+def measure_latency(
+    policies: Mapping[str, Policy],
+    *,
+    repetitions: int = 50,
+    warmup: int = 5,
+    threads: int = 1,
+    seed: int = 0,
+) -> dict[str, Latency]:
+    """Time one decision of each policy at batch 1.
+
+    One repetition times every policy once, in turn, so that a machine that slows down for a while slows
+    all of them and their ratios stay fair. The clock runs from an observation in the CPU's memory to
+    the action in the CPU's memory: transfers, encoder, noise and all network evaluations included. A
+    CUDA device is synchronised before the clock starts and before it stops.
+
+    Args:
+        policies: name -> policy, each on its own device.
+        repetitions: timed decisions per policy.
+        warmup: decisions before the first timed one, not counted.
+        threads: torch's intra-op threads while measuring; the former number is restored.
+        seed: of the observation and the noise.
+
+    Raises:
+        ConfigError: a count below one.
+    """
+    if min(repetitions, threads) < 1 or warmup < 0:
+        raise ConfigError(
+            f"repetitions={repetitions} and threads={threads} must be at least 1, warmup={warmup} at least 0"
+        )
+    observations = {name: example_observation(p.spec, p.chunk, seed) for name, p in policies.items()}
+    times: dict[str, list[float]] = {name: [] for name in policies}
+    with torch_threads(threads), torch.inference_mode():
+        for repetition in range(warmup + repetitions):
+            for name, policy in policies.items():
+                elapsed = _time_decision(policy.eval(), observations[name], seed)
+                if repetition >= warmup:
+                    times[name].append(elapsed)
+    return {name: _summary(policies[name], times[name], threads) for name in policies}
+
+
+@contextmanager
+def torch_threads(count: int) -> Iterator[None]:
+    """Set torch's intra-op threads to `count` within the block and restore the former number after it."""
+    before = torch.get_num_threads()
+    torch.set_num_threads(count)
+    try:
+        yield
+    finally:
+        torch.set_num_threads(before)
+
+
+def _time_decision(policy: Policy, obs: Mapping[str, torch.Tensor], seed: int) -> float:
+    """Return the wall time of one decision, milliseconds."""
+    device = policy.device
+    generator = torch.Generator(device).manual_seed(seed)
+    _synchronize(device)
+    start = time.perf_counter_ns()
+    policy.act({key: value.to(device) for key, value in obs.items()}, generator=generator).cpu()
+    _synchronize(device)
+    return (time.perf_counter_ns() - start) / 1e6
+
+
+def _synchronize(device: torch.device) -> None:
+    # Kernels run after the call that launched them has returned; the host's clock must wait for them.
+    if device.type == "cuda":
+        torch.cuda.synchronize(device)
+
+
+def _summary(policy: Policy, times_ms: list[float], threads: int) -> Latency:
+    device = policy.device
+    return Latency(
+        median_ms=float(np.median(times_ms)),
+        p95_ms=float(np.percentile(times_ms, 95)),
+        n=len(times_ms),
+        nfe=policy.nfe,
+        threads=threads,
+        dtype=str(next(policy.parameters()).dtype).removeprefix("torch."),
+        device=torch.cuda.get_device_name(device) if device.type == "cuda" else device.type,
+    )

@@ -1,0 +1,235 @@
+"""Turn results.json into tables, plots, a Markdown file and one self-contained HTML page."""
+
+from __future__ import annotations
+
+import base64
+import io
+import re
+from collections.abc import Mapping, Sequence
+from importlib import resources
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import jinja2
+from matplotlib.figure import Figure
+from rich.table import Table
+
+from manicm_ms.paths import write_text
+
+PAPER_LATENCY_MS = {"DP3, paper": 177.6, "ManiCM, paper": 17.3}
+"""Mean decision times on an RTX 4090, milliseconds: ManiCM (arXiv:2406.01586), table of results, last column."""
+
+ROLE_COLORS = {"teacher": "#3b76c4", "control": "#8c93a0", "student": "#e07b39", "paper": "#b9bec7"}
+
+# Plots are drawn in this colour and then told to use the page's own, so that they follow light and dark.
+_INK = "#010203"
+
+
+class Row(NamedTuple):
+    """One policy of the results, formatted for people."""
+
+    name: str
+    role: str
+    nfe: str
+    success: str
+    interval: str
+    crashed: str
+    median: str
+    p95: str
+    where: str
+
+
+def rows(results: Mapping[str, Any]) -> list[Row]:
+    """Return one formatted row per policy, in the order of the results."""
+    return [_row(policy) for policy in results["policies"]]
+
+
+def _row(policy: Mapping[str, Any]) -> Row:
+    low, high = policy["ci95"]
+    threads = "1 thread" if policy["threads"] == 1 else f"{policy['threads']} threads"
+    return Row(
+        name=policy["name"],
+        role=policy["role"],
+        nfe=str(policy["nfe"]),
+        success=f"{policy['successes']}/{policy['n']} = {100 * policy['success_rate']:.1f} %",
+        interval=f"{100 * low:.1f} to {100 * high:.1f} %",
+        crashed=str(policy["crashed"]),
+        median=format_ms(policy["latency_ms"]["median"]),
+        p95=format_ms(policy["latency_ms"]["p95"]),
+        where=f"{policy['device']}, {threads}, {policy['dtype']}",
+    )
+
+
+def format_ms(milliseconds: float) -> str:
+    """Return a time with three significant digits, one decimal at least above 1 ms."""
+    return f"{milliseconds:.3g} ms" if milliseconds < 10 else f"{milliseconds:.1f} ms"
+
+
+_HEADERS = ("Policy", "Role", "NFE", "Success", "95 % interval", "Crashed", "Decision, median", "p95", "Measured on")
+
+
+def paired_sentences(results: Mapping[str, Any]) -> list[str]:
+    """Return what the paired comparison says, in words; nothing where there is no pair."""
+    pair = results["paired"]
+    if pair is None:
+        return []
+    low, high = pair["difference_ci95"]
+    n = pair["both"] + pair["only_first"] + pair["only_second"] + pair["neither"]
+    sentences = [
+        f"On the same {n} seeds both succeeded on {pair['both']}, only {pair['first']} on {pair['only_first']}, "
+        f"only {pair['second']} on {pair['only_second']}, neither on {pair['neither']}.",
+        f"Success rate of {pair['second']} minus that of {pair['first']}: {100 * pair['difference']:+.1f} points "
+        f"(95 % interval {100 * low:+.1f} to {100 * high:+.1f}; McNemar's exact test p = {pair['mcnemar_p']:.3g}).",
+    ]
+    first, second = results["policies"][0]["latency_ms"]["median"], results["policies"][-1]["latency_ms"]["median"]
+    sentences.append(
+        f"{pair['second']} decides {first / second:.1f} times as fast as {pair['first']} "
+        f"({results['policies'][-1]['nfe']} network evaluation(s) against {results['policies'][0]['nfe']})."
+    )
+    return sentences
+
+
+def crash_lines(results: Mapping[str, Any]) -> list[str]:
+    """Return one line per crashed episode."""
+    return [
+        f"{policy['name']}, seed {episode['seed']}: {episode['crashed']}"
+        for policy in results["policies"]
+        for episode in policy["episodes"]
+        if episode["crashed"] is not None
+    ]
+
+
+def summary_table(results: Mapping[str, Any]) -> Table:
+    """Return the table that the command line prints."""
+    table = Table(title=f"{results['env_id']}, {len(results['seeds'])} seeds from {results['seeds'][0]}")
+    for header, key in zip(_HEADERS, Row._fields, strict=True):
+        table.add_column(header, justify="left" if key in ("name", "role", "where") else "right")
+    for row in rows(results):
+        table.add_row(*row)
+    if results["paired"] is not None:
+        table.caption = "\n".join(paired_sentences(results))
+    return table
+
+
+def render_markdown(results: Mapping[str, Any]) -> str:
+    """Return the report as Markdown."""
+    return _template("report.md.j2", autoescape=False).render(**_context(results))
+
+
+def render_html(results: Mapping[str, Any], videos: Sequence[Mapping[str, Any]] = ()) -> str:
+    """Return the report as one HTML page that loads nothing from elsewhere.
+
+    Args:
+        results: what results.json holds.
+        videos: entries with seed, policy, success and `data` (the mp4 file's bytes).
+    """
+    scenes: dict[int, list[dict[str, Any]]] = {}
+    for video in videos:
+        source = "data:video/mp4;base64," + base64.b64encode(video["data"]).decode("ascii")
+        scenes.setdefault(video["seed"], []).append({**video, "data": source})
+    figures = {"success": success_plot(results), "latency": latency_plot(results)}
+    return _template("report.html.j2", autoescape=True).render(**_context(results), figures=figures, scenes=scenes)
+
+
+def write_report(results: Mapping[str, Any], out: Path) -> None:
+    """Write report.md and report.html, each whole or not at all; `results["videos"]` lie under `out`."""
+    videos = [{**video, "data": (out / video["file"]).read_bytes()} for video in results.get("videos", ())]
+    write_text(out / "report.md", render_markdown(results))
+    write_text(out / "report.html", render_html(results, videos))
+
+
+def success_plot(results: Mapping[str, Any]) -> str:
+    """Return an SVG of the success rates with their 95 % intervals."""
+    policies = results["policies"]
+    figure, axes = _axes(len(policies))
+    for y, policy in enumerate(policies):
+        rate, (low, high) = policy["success_rate"], policy["ci95"]
+        axes.barh(y, 100 * rate, color=ROLE_COLORS[policy["role"]], height=0.62)
+        error = [[100 * max(rate - low, 0)], [100 * max(high - rate, 0)]]
+        axes.errorbar(100 * rate, y, xerr=error, color=_INK, capsize=4, lw=1.4)
+        axes.text(103, y, f"{100 * rate:.1f} %", va="center", color=_INK)
+    axes.set_xlim(0, 100)
+    axes.set_xlabel("success rate, % (bar) with 95 % Wilson interval")
+    _label(axes, [p["name"] for p in policies])
+    return _svg(figure, "Success rate of each policy with its 95 % interval")
+
+
+def latency_plot(results: Mapping[str, Any]) -> str:
+    """Return an SVG of the decision times on a log scale, the paper's beside ours."""
+    ours = [(p["name"], p["latency_ms"]["median"], p["latency_ms"]["p95"], p["role"]) for p in results["policies"]]
+    theirs = [(name, value, None, "paper") for name, value in PAPER_LATENCY_MS.items()]
+    entries = ours + theirs
+    figure, axes = _axes(len(entries))
+    values = [value for _, value, _, _ in entries]
+    left = 10 ** _floor_log10(min(values) / 1.5)
+    for y, (_, median, p95, role) in enumerate(entries):
+        axes.barh(y, median - left, left=left, color=ROLE_COLORS[role], height=0.62)
+        if p95 is not None:
+            axes.plot([p95], [y], marker="|", ms=13, mew=1.6, color=_INK)
+        axes.text(max(median, p95 or 0) * 1.12, y, format_ms(median), va="center", color=_INK)
+    axes.set_xscale("log")
+    axes.set_xlim(left, 6 * max(values))
+    axes.set_xlabel("one decision, ms, log scale (bar: median, tick: p95; paper: mean on an RTX 4090)")
+    _label(axes, [name for name, *_ in entries])
+    return _svg(figure, "Wall time of one decision of each policy beside the paper's")
+
+
+def _floor_log10(value: float) -> int:
+    exponent = 0
+    while 10.0**exponent > value:
+        exponent -= 1
+    while 10.0 ** (exponent + 1) <= value:
+        exponent += 1
+    return exponent
+
+
+def _axes(bars: int) -> tuple[Figure, Any]:
+    figure = Figure(figsize=(7.4, 0.9 + 0.42 * bars), layout="constrained")
+    axes = figure.subplots()
+    axes.invert_yaxis()
+    axes.spines[["top", "right", "left"]].set_visible(False)
+    axes.spines["bottom"].set_color(_INK)
+    axes.tick_params(colors=_INK, which="both")
+    axes.xaxis.label.set_color(_INK)
+    axes.grid(axis="x", color=_INK, alpha=0.12, lw=0.8)
+    axes.set_axisbelow(True)
+    axes.patch.set_alpha(0)
+    return figure, axes
+
+
+def _label(axes: Any, names: Sequence[str]) -> None:
+    axes.set_yticks(range(len(names)), names)
+    axes.tick_params(axis="y", length=0)
+
+
+def _svg(figure: Figure, description: str) -> str:
+    """Return the figure as inline SVG whose text and lines take the page's colour."""
+    from matplotlib import rc_context
+
+    buffer = io.StringIO()
+    with rc_context({"svg.fonttype": "none", "svg.hashsalt": "manicm_ms", "font.size": 10}):
+        figure.savefig(buffer, format="svg", transparent=True, metadata={"Date": None})
+    svg = buffer.getvalue()
+    svg = svg[svg.index("<svg") :].replace(_INK, "currentColor")
+    svg = re.sub(r"<metadata>.*?</metadata>", "", svg, flags=re.DOTALL)
+    return svg.replace("<svg", f'<svg role="img" aria-label="{description}"', 1)
+
+
+def _context(results: Mapping[str, Any]) -> dict[str, Any]:
+    return {
+        "results": results,
+        "headers": _HEADERS,
+        "rows": rows(results),
+        "sentences": paired_sentences(results),
+        "crashes": crash_lines(results),
+        "format_ms": format_ms,
+        "paper": PAPER_LATENCY_MS,
+    }
+
+
+def _template(name: str, *, autoescape: bool) -> jinja2.Template:
+    text = resources.files("manicm_ms.evaluation").joinpath("templates", name).read_text(encoding="utf-8")
+    environment = jinja2.Environment(
+        autoescape=autoescape, undefined=jinja2.StrictUndefined, trim_blocks=True, lstrip_blocks=True
+    )
+    return environment.from_string(text)

@@ -1,0 +1,300 @@
+"""Play a policy on a list of seeds in a vector env: every seed exactly once, a crash counts as a failure."""
+
+from __future__ import annotations
+
+import base64
+import contextlib
+from collections import deque
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import torch
+
+from manicm_ms.errors import BackendError, ConfigError
+from manicm_ms.types import ChunkSpec, require_compatible
+
+if TYPE_CHECKING:
+    from manicm_ms.envs.vec_env import VecEnv
+    from manicm_ms.policies.base import Policy
+
+MAX_RESTARTS = 3
+"""Restarts of a dead env in a row, without an episode that ended by itself, before the roll-out gives up."""
+
+_NOISE_STREAM = 0x4D53
+"""Sets the policy's noise apart from whatever else is drawn from an episode's seed."""
+
+
+@dataclass(frozen=True)
+class EpisodeResult:
+    """What became of one episode.
+
+    Attributes:
+        seed: the episode's seed; it fixes the initial state and the policy's noise.
+        success: by the env's `success_rule`; always False for a crashed episode.
+        steps: control steps played.
+        decisions: policy calls.
+        total_return: sum of rewards.
+        crashed: why the episode could not be played to its end, None where it was.
+        actions: (decisions, Ta, Da) float32, the actions commanded; with the seed they replay the episode.
+    """
+
+    seed: int
+    success: bool
+    steps: int
+    decisions: int
+    total_return: float
+    crashed: str | None = None
+    actions: np.ndarray = field(default_factory=lambda: np.zeros((0, 1, 1), np.float32), compare=False, repr=False)
+
+    def to_record(self) -> dict[str, Any]:
+        """Return plain JSON values, actions as base64 of little-endian float32; `from_record` is its inverse."""
+        packed = base64.b64encode(np.ascontiguousarray(self.actions, dtype="<f4").tobytes()).decode("ascii")
+        return {**self.summary(), "actions_shape": list(self.actions.shape), "actions": packed}
+
+    def summary(self) -> dict[str, Any]:
+        """Return plain JSON values without the actions."""
+        return {
+            "seed": self.seed,
+            "success": self.success,
+            "steps": self.steps,
+            "decisions": self.decisions,
+            "return": self.total_return,
+            "crashed": self.crashed,
+        }
+
+    @classmethod
+    def from_record(cls, record: Mapping[str, Any]) -> EpisodeResult:
+        """Build a result from what `to_record` returned."""
+        flat = np.frombuffer(base64.b64decode(record["actions"]), dtype="<f4").astype(np.float32)
+        return cls(
+            seed=int(record["seed"]),
+            success=bool(record["success"]),
+            steps=int(record["steps"]),
+            decisions=int(record["decisions"]),
+            total_return=float(record["return"]),
+            crashed=record["crashed"],
+            actions=flat.reshape(record["actions_shape"]),
+        )
+
+
+class RestartableEnv:
+    """Holds a vector env and builds it anew when its workers have died.
+
+    Args:
+        make_env: builds the env; called once now and once per `restart`.
+
+    Attributes:
+        env: the env that is alive at present.
+    """
+
+    def __init__(self, make_env: Callable[[], VecEnv]) -> None:
+        self._make_env = make_env
+        self.env = make_env()
+
+    def restart(self) -> None:
+        """Close what is left of the dead env and build a fresh one in its place."""
+        with contextlib.suppress(Exception):  # a half-dead env may fail in any way while it is closed
+            self.env.close()
+        self.env = self._make_env()
+
+    def close(self) -> None:
+        """Close the env; twice is fine."""
+        self.env.close()
+
+
+def require_chunk(vec_env: VecEnv, chunk: ChunkSpec) -> None:
+    """Raise ConfigError unless the env returns the frames and plays the actions of `chunk`."""
+    theirs = vec_env.chunk
+    ours = (chunk.n_obs_steps, chunk.n_action_steps)
+    if theirs is None or (theirs.n_obs_steps, theirs.n_action_steps) != ours:
+        raise ConfigError(f"the env plays {theirs} and the policy {chunk}: make the env with chunk=policy.chunk")
+
+
+def rollout(
+    vec_env: VecEnv | RestartableEnv,
+    policy: Policy,
+    seeds: Sequence[int],
+    *,
+    on_episode: Callable[[EpisodeResult], None] | None = None,
+) -> list[EpisodeResult]:
+    """Play one episode per seed and return the results in the order of `seeds`.
+
+    The protocol:
+
+    1. A row without an episode takes the next seed and is reset; the other rows go on undisturbed.
+    2. The policy decides for all N rows at once, idle ones included, so that the batch keeps one size.
+       Row i's noise is a function of its episode's seed and the number of the decision alone.
+    3. The env plays the chunk in all rows. Rows that ended give their result; back to 1.
+    4. A row whose simulation or policy fails (error in the env, an action that is not finite) is a failed
+       episode with its reason. If the env itself dies (BackendError), all episodes in flight are failed
+       ones; a `RestartableEnv` is restarted and the remaining seeds go on, any other env ends the
+       roll-out with that error.
+
+    Noise and initial state depend on the seed alone, hence the same seed meets two policies, or two
+    values of num_envs, under the same conditions. Bit-equal results are promised for the same num_envs
+    and the same list of seeds only: matrix products may round differently at another batch size.
+
+    Args:
+        vec_env: env with N rows, made with `chunk=policy.chunk`.
+        policy: decides; it stays on its device and is put in evaluation mode.
+        seeds: distinct non-negative integers.
+        on_episode: called with each result as soon as it is known, in order of completion.
+
+    Raises:
+        ConfigError: seeds that repeat, or an env made for another chunk.
+        SpecMismatchError: a policy made for other observations or actions.
+        BackendError: an env that cannot be restarted, or that keeps dying.
+    """
+    if len(set(seeds)) != len(seeds):
+        raise ConfigError("every seed may be played once only: the list of seeds repeats some")
+    env = vec_env.env if isinstance(vec_env, RestartableEnv) else vec_env
+    require_chunk(env, policy.chunk)
+    require_compatible(env.env_spec, policy.spec, f"environment {env.env_spec.env_id}", "the policy")
+    policy.eval()
+    with torch.no_grad():
+        results = _Rollout(vec_env, policy, seeds, on_episode).run()
+    return [results[seed] for seed in seeds]
+
+
+def decision_noise(seed: int, decision: int, shape: tuple[int, ...]) -> torch.Tensor:
+    """Return the Gaussian noise, float32 on the CPU, of one decision of the episode with this seed.
+
+    A shorter leading axis gives the beginning of a longer one: policies that draw once and policies that
+    draw several times start from the same array.
+    """
+    state = np.random.SeedSequence((seed, _NOISE_STREAM, decision)).generate_state(1, np.uint64)[0]
+    generator = torch.Generator().manual_seed(int(state) >> 1)  # torch takes 63 bits without wrapping
+    return torch.stack([torch.randn(shape[1:], generator=generator) for _ in range(shape[0])])
+
+
+class _Episode:
+    """An episode in flight in one row."""
+
+    def __init__(self, seed: int) -> None:
+        self.seed = seed
+        self.steps = 0
+        self.total_return = 0.0
+        self.actions: list[np.ndarray] = []  # each (Ta, Da)
+
+    def result(self, success: bool, crashed: str | None = None) -> EpisodeResult:
+        actions = np.stack(self.actions) if self.actions else np.zeros((0, 1, 1), np.float32)
+        return EpisodeResult(
+            self.seed, success and crashed is None, self.steps, len(self.actions), self.total_return, crashed, actions
+        )
+
+
+class _Rollout:
+    """The state of one call of `rollout`."""
+
+    def __init__(
+        self,
+        vec_env: VecEnv | RestartableEnv,
+        policy: Policy,
+        seeds: Sequence[int],
+        on_episode: Callable[[EpisodeResult], None] | None,
+    ) -> None:
+        self.home = vec_env if isinstance(vec_env, RestartableEnv) else None
+        self.env: VecEnv = vec_env.env if isinstance(vec_env, RestartableEnv) else vec_env
+        self.policy, self.on_episode = policy, on_episode
+        self.pending = deque(int(s) for s in seeds)
+        self.rows: list[_Episode | None] = [None] * self.env.num_envs
+        self.results: dict[int, EpisodeResult] = {}
+        self.obs: Mapping[str, torch.Tensor] | None = None  # None until the env's first reset
+        self.restarts = 0
+
+    def run(self) -> dict[int, EpisodeResult]:
+        while self.pending or any(self.rows):
+            try:
+                self._start_episodes()
+                self._play(self._decide())
+            except BackendError as error:
+                self._bury_env(error)
+        return self.results
+
+    def _start_episodes(self) -> None:
+        fresh = np.zeros(len(self.rows), dtype=bool)
+        for i, episode in enumerate(self.rows):
+            if episode is None and self.pending:
+                self.rows[i] = _Episode(self.pending.popleft())
+                fresh[i] = True
+        if not fresh.any():
+            return
+        # Rows without an episode need a first reset too; any seed will do, nobody looks at them.
+        mask = fresh if self.obs is not None else np.ones_like(fresh)
+        spare = next(e.seed for e in self.rows if e is not None)
+        seeds = [spare if e is None else e.seed for e in self.rows]
+        self.obs, _ = self.env.reset(seed=seeds, options={"reset_mask": mask})
+
+    def _decide(self) -> torch.Tensor:
+        """Return actions (N, Ta, Da); end the episodes of rows whose action is not finite."""
+        assert self.obs is not None
+        device = self.policy.device
+        obs = {key: value.to(device) for key, value in self.obs.items()}
+        actions = self.policy.act(obs, noise=self._noise().to(device))
+        finite = torch.isfinite(actions).flatten(1).all(1).cpu()
+        actions = torch.where(finite.to(device)[:, None, None], actions, torch.zeros_like(actions))
+        played = actions.float().cpu().numpy()
+        for i, episode in enumerate(self.rows):
+            if episode is None:
+                continue
+            if finite[i]:
+                episode.actions.append(played[i].copy())
+            else:
+                self._end(i, False, f"the policy's action {len(episode.actions)} is not finite")
+        return actions.to(self.env.device)
+
+    def _noise(self) -> torch.Tensor:
+        """Return noise (noise_draws, N, Tp, Da): row i of its episode's seed, zeros where there is no episode."""
+        policy = self.policy
+        shape = (policy.noise_draws, policy.chunk.horizon, policy.spec.action.dim)
+        rows = [torch.zeros(shape) if e is None else decision_noise(e.seed, len(e.actions), shape) for e in self.rows]
+        return torch.stack(rows, dim=1)
+
+    def _play(self, actions: torch.Tensor) -> None:
+        if not any(self.rows):
+            return
+        self.obs, reward, terminated, truncated, info = self.env.step(actions)
+        rewards = _numpy(reward)
+        ended = _numpy(terminated) | _numpy(truncated)
+        steps = _numpy(info["elapsed_steps"])
+        success = _numpy(info["success_once" if self.env.env_spec.success_rule == "any" else "success"])
+        for i, episode in enumerate(self.rows):
+            if episode is None:
+                continue
+            episode.total_return += float(np.nan_to_num(rewards[i]))
+            episode.steps = int(steps[i])
+            error = info["error"][i]
+            if ended[i] or error is not None:
+                self._end(i, bool(success[i]), error)
+
+    def _end(self, row: int, success: bool, crashed: str | None) -> None:
+        episode = self.rows[row]
+        assert episode is not None
+        self.rows[row] = None
+        if crashed is None:
+            self.restarts = 0
+        self.results[episode.seed] = result = episode.result(success, crashed)
+        if self.on_episode is not None:
+            self.on_episode(result)
+
+    def _bury_env(self, error: BackendError) -> None:
+        """Fail the episodes in flight and restart the env, or raise where that cannot help."""
+        if self.home is None:
+            raise error
+        self.restarts += 1
+        if self.restarts > MAX_RESTARTS:
+            raise BackendError(
+                f"the env died {self.restarts} times in a row without finishing an episode; last: {error}"
+            ) from error
+        for i, episode in enumerate(self.rows):
+            if episode is not None:
+                self._end(i, False, f"the env died: {error}")
+        self.obs = None
+        self.home.restart()
+        self.env = self.home.env
+
+
+def _numpy(value: Any) -> np.ndarray:
+    return value.detach().cpu().numpy() if isinstance(value, torch.Tensor) else np.asarray(value)

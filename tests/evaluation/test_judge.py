@@ -1,0 +1,182 @@
+"""The whole judgement on a real, small env: numbers derive from records, reports hold them, kills do no harm."""
+
+import dataclasses
+import io
+import json
+import re
+
+import pytest
+from point_mass import SPEC, PointMass, Proportional
+from rich.console import Console
+
+from manicm_ms.errors import ConfigError, OutputExistsError
+from manicm_ms.evaluation.judge import CONTROL, STUDENT, TEACHER, Contender, EnvMaker, Protocol, judge
+from manicm_ms.evaluation.records import EpisodeLog
+from manicm_ms.evaluation.report import render_markdown
+from manicm_ms.evaluation.statistics import compare_paired, wilson_interval
+
+SEEDS = tuple(range(100, 124))
+COMMAND = "manicm-ms evaluate teacher student --env toy/point-mass --episodes 24 --seed 100 --out report"
+
+
+def contenders():
+    return [
+        Contender("teacher", TEACHER, "runs/teacher", Proportional(gain=2.0, noise_scale=0.6)),
+        Contender("teacher, one step", CONTROL, "runs/teacher", Proportional(gain=0.5)),
+        Contender("student", STUDENT, "runs/student", Proportional(gain=2.5, noise_scale=0.7)),
+    ]
+
+
+def run(out, *, request=None, crash_at=None, made=None, videos=2, seeds=SEEDS):
+    def for_policy(policy, n):
+        env = PointMass(n, policy.chunk, crash_at=crash_at)
+        if made is not None:
+            made.append(env)
+        return env
+
+    protocol = Protocol(SPEC.env_id, seeds, num_envs=4, repetitions=3, videos=videos)
+    envs = EnvMaker(for_policy, lambda n: PointMass(n, chunk=None))
+    console = Console(file=io.StringIO(), width=160)
+    results = judge(contenders(), protocol, envs, out, request or {"seed": 100}, COMMAND, console)
+    return results, console.file.getvalue()
+
+
+@pytest.fixture(scope="module")
+def report(tmp_path_factory):
+    out = tmp_path_factory.mktemp("judge") / "report"
+    results, printed = run(out, crash_at={103: 2})
+    return out, results, printed
+
+
+def test_results_json_is_strict_and_has_the_promised_keys(report):
+    out, results, _ = report
+    stored = json.loads((out / "results.json").read_text(), parse_constant=lambda c: pytest.fail(f"{c} in JSON"))
+    assert stored == json.loads(json.dumps(results))
+    assert {"env_id", "seeds", "command", "versions", "policies", "paired"} <= stored.keys()
+    assert [p["name"] for p in stored["policies"]] == ["teacher", "teacher, one step", "student"]
+    keys = {
+        "name",
+        "checkpoint",
+        "nfe",
+        "n",
+        "successes",
+        "success_rate",
+        "ci95",
+        "latency_ms",
+        "device",
+        "threads",
+        "dtype",
+    }
+    assert all(keys <= p.keys() and {"median", "p95"} <= p["latency_ms"].keys() for p in stored["policies"])
+    pair_keys = {"both", "only_first", "only_second", "neither", "difference", "difference_ci95", "mcnemar_p"}
+    assert pair_keys <= stored["paired"].keys()
+    assert stored["seeds"] == list(SEEDS)
+
+
+def test_every_number_derives_from_the_episode_records(report):
+    out, results, _ = report
+    outcomes = {}
+    for policy, file in zip(results["policies"], ["teacher", "teacher-one-step", "student"], strict=True):
+        with EpisodeLog(out / "episodes" / f"{file}.jsonl") as log:
+            episodes = [log[s] for s in SEEDS]
+        outcomes[policy["name"]] = [e.success for e in episodes]
+        assert policy["successes"] == sum(outcomes[policy["name"]])
+        assert policy["n"] == len(SEEDS)
+        assert policy["success_rate"] == policy["successes"] / len(SEEDS)
+        assert policy["ci95"] == list(wilson_interval(policy["successes"], len(SEEDS)))
+        assert policy["crashed"] == 1
+        assert policy["episodes"] == [e.summary() for e in episodes]
+    pair = compare_paired(outcomes["teacher"], outcomes["student"])
+    assert {k: results["paired"][k] for k in pair.counts._fields} == pair.counts._asdict()
+    assert results["paired"]["difference"] == pair.difference
+    assert results["paired"]["mcnemar_p"] == pair.mcnemar_p
+
+
+def test_a_crashed_episode_stays_in_the_denominator_and_is_shown(report):
+    out, results, _ = report
+    assert all(p["n"] == 24 and not p["episodes"][3]["success"] for p in results["policies"])
+    assert "seed 103: solver diverged" in (out / "report.md").read_text()
+    assert "seed 103: solver diverged" in (out / "report.html").read_text()
+
+
+def test_the_html_is_self_contained_and_holds_table_plots_videos_and_command(report):
+    out, results, printed = report
+    html = (out / "report.html").read_text()
+    loaded = re.findall(r"""(?:src|href)\s*=\s*["']([^"']+)""", html)
+    assert loaded
+    assert all(link.startswith(("data:", "#")) for link in loaded), "loads something from elsewhere"
+    assert "@import" not in html
+    assert html.count("<svg") == 2
+    assert html.count("data:video/mp4;base64,") == len(results["videos"]) == 4
+    assert "177.6" in html
+    assert "17.3" in html
+    for policy in results["policies"]:
+        share = f"{policy['successes']}/{policy['n']} = {100 * policy['success_rate']:.1f} %"
+        assert share in html
+        assert share in (out / "report.md").read_text()
+        assert share in printed
+    assert COMMAND in html
+    assert str(out / "report.html") in printed
+
+
+def test_videos_are_of_the_same_seeds_for_both_policies(report):
+    _, results, _ = report
+    by_policy = {}
+    for video in results["videos"]:
+        by_policy.setdefault(video["policy"], []).append(video["seed"])
+    assert by_policy["teacher"] == by_policy["student"]
+    assert set(by_policy) == {"teacher", "student"}
+
+
+def test_the_same_call_plays_nothing_again_and_tells_the_same(report):
+    out, results, _ = report
+    made = []
+    again, _ = run(out, crash_at={103: 2}, made=made)
+    assert made == []
+    assert again == results
+
+
+def test_a_run_stopped_midway_goes_on_with_the_missing_episodes_only(tmp_path, report):
+    out = tmp_path / "report"
+    run(out, crash_at={103: 2})
+    log = out / "episodes" / "student.jsonl"
+    lines = log.read_bytes().splitlines(keepends=True)
+    log.write_bytes(b"".join(lines[:10]) + lines[10][:40])
+    (out / "results.json").unlink()
+    made = []
+    resumed, _ = run(out, crash_at={103: 2}, made=made)
+    kept = {json.loads(line)["seed"] for line in lines[:10]}
+    assert sorted(made[0].played) == sorted(set(SEEDS) - kept)
+    assert [p["episodes"] for p in resumed["policies"]] == [p["episodes"] for p in report[1]["policies"]]
+    assert resumed["paired"] == report[1]["paired"]
+
+
+def test_another_evaluation_does_not_touch_the_folder(report):
+    out, _, _ = report
+    before = {p: p.read_bytes() for p in out.rglob("*") if p.is_file()}
+    with pytest.raises(OutputExistsError, match="another evaluation"):
+        run(out, request={"seed": 7})
+    assert {p: p.read_bytes() for p in out.rglob("*") if p.is_file()} == before
+
+
+def test_a_policy_alone_is_judged_without_a_pair(tmp_path):
+    protocol = Protocol(SPEC.env_id, SEEDS[:4], num_envs=2, repetitions=1, videos=0)
+    envs = EnvMaker(lambda policy, n: PointMass(n, policy.chunk), lambda n: PointMass(n, chunk=None))
+    results = judge(contenders()[:1], protocol, envs, tmp_path / "r", {}, COMMAND, Console(file=io.StringIO()))
+    assert results["paired"] is None
+    assert "On the same" not in render_markdown(results)
+
+
+def test_names_cannot_break_the_page(tmp_path):
+    hostile = dataclasses.replace(contenders()[0], name="<script>alert(1)</script>")
+    protocol = Protocol(SPEC.env_id, SEEDS[:2], num_envs=2, repetitions=1, videos=1)
+    envs = EnvMaker(lambda policy, n: PointMass(n, policy.chunk), lambda n: PointMass(n, chunk=None))
+    judge([hostile], protocol, envs, tmp_path / "r", {}, COMMAND, Console(file=io.StringIO()))
+    assert "<script>" not in (tmp_path / "r" / "report.html").read_text()
+
+
+def test_a_senseless_protocol_is_refused():
+    with pytest.raises(ConfigError, match="at least one episode"):
+        Protocol(SPEC.env_id, (), num_envs=1)
+    with pytest.raises(ConfigError, match="num_envs"):
+        Protocol(SPEC.env_id, (1,), num_envs=0)
