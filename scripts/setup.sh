@@ -1,10 +1,10 @@
-#!/bin/sh
+#!/usr/bin/env bash
 # Set-up: the environment .venv with the pinned dependencies, one OpenCV, and a Vulkan device that renders.
 #
 # Run by `make setup`, and by `make demo` and `make test` before their work. A second run finds the stamp and ends at
 # once; FORCE=1 looks at everything again. An interrupted run is repaired by the next one.
 #   PYTHON=...   interpreter to make .venv with (3.11 to 3.13); default: the first suitable one on PATH
-set -eu
+set -euo pipefail
 cd "$(dirname "$0")/.."
 
 VENV=.venv
@@ -63,7 +63,12 @@ venv_works() {
     [ ! -e $INSTALLING ] && suitable $VENV/bin/python && $VENV/bin/python -m pip --version >/dev/null 2>&1
 }
 
-pip_install() { $VENV/bin/python -m pip install -q --no-input --disable-pip-version-check -c constraints.txt "$@"; }
+# pip, telling the large downloads and the installation alone.
+pip_install() {
+    $VENV/bin/python -m pip install --no-input --disable-pip-version-check --progress-bar off -c constraints.txt "$@" \
+        2> >(grep -v '^WARNING: Location' >&2) |
+        { grep --line-buffered -E '^ *(Downloading .* MB|Installing|Successfully)' | cut -c 1-120 || true; }
+}
 
 install_packages() {
     say "installing the pinned dependencies (the first time fetches some hundred MB and takes minutes)"

@@ -28,7 +28,7 @@ from pathlib import Path
 
 REPO = Path(__file__).resolve().parents[1]
 PRIVATE = REPO / ".vulkan"
-PACKAGES = ("mesa-vulkan-drivers", "libvulkan1")
+PACKAGES = ("mesa-vulkan-drivers", "libvulkan1", "libx11-6")  # SAPIEN itself links libX11
 NEEDED_MESA = (24, 3)  # lavapipe before 24.3 lacks what SAPIEN asks of a rendering device
 BACKPORTS_FILE = "manicm-ms-backports.sources"
 ALIASES = ("stable", "oldstable", "testing")  # suites that a sources file may name in place of the code name
@@ -282,17 +282,21 @@ def write_private_manifest(python: str, folder: Path) -> None:
 
 
 def private_needs(library: Path, folder: Path) -> list[Path]:
-    """Return the libraries in `folder` that `library` needs, as the dynamic linker finds them there."""
-    places = sorted({str(p.parent) for p in folder.glob("root/usr/lib/**/*.so*")} | {str(library.parent)})
+    """Return the libraries in `folder` that the driver `library` and SAPIEN need, as the linker finds them there."""
+    places = sorted({str(p.parent) for p in folder.glob("root/usr/lib/**/*.so*")})
     env = {**os.environ, "LD_LIBRARY_PATH": ":".join(places)}
-    text = subprocess.run(["ldd", str(library)], text=True, capture_output=True, env=env, check=False).stdout
-    missing = re.findall(r"(\S+) => not found", text)
+    wanted = [library, *folder.glob("root/usr/lib/**/libX11.so.6")]  # the second is there where the system lacks it
+    text = "".join(
+        subprocess.run(["ldd", str(path)], text=True, capture_output=True, env=env, check=False).stdout
+        for path in wanted
+    )
+    missing = sorted(set(re.findall(r"(\S+) => not found", text)))
     if missing:
         raise SetupError(
             f"the private Vulkan driver needs {', '.join(missing)}: install it, or run 'make setup' as root"
         )
-    found = [Path(p) for p in re.findall(r"=> (/\S+)", text)]
-    return [p for p in found if p.is_relative_to(folder) and not p.name.startswith(RUNTIME)]
+    found = [*wanted[1:], *(Path(p) for p in re.findall(r"=> (/\S+)", text))]
+    return [p for p in dict.fromkeys(found) if p.is_relative_to(folder) and not p.name.startswith(RUNTIME)]
 
 
 _LOAD_ORDER = """
@@ -383,7 +387,7 @@ def ensure_device(python: str) -> str:
         unpack_privately(python, codename)
     if name := existing_device(python):
         return name
-    raise SetupError("Mesa's driver is in place and still nothing renders: run 'manicm-ms doctor' for the reason")
+    raise SetupError(f"Mesa's driver is in place and still nothing renders: '{python} -m manicm_ms.vulkan' says why")
 
 
 def note_missing_graphics(name: str) -> None:
