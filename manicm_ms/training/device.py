@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import logging
+
 import torch
 from lightning_fabric import Fabric
 
@@ -56,8 +58,10 @@ def make_fabric(device: torch.device, precision: str, num_devices: int = 1) -> F
 
     Call it before anything is written: the other processes run the same command from its beginning.
     """
+    # Fabric announces the precision on standard error; the checkpoint records it.
+    logging.getLogger("lightning_fabric").setLevel(logging.WARNING)
     devices = [device.index] if device.type == "cuda" and num_devices == 1 else num_devices
     strategy = "auto" if num_devices == 1 else "ddp"
-    fabric = Fabric(accelerator=device.type, devices=devices, strategy=strategy, precision=precision)
+    fabric = Fabric(accelerator=device.type, devices=devices, strategy=strategy, precision=precision)  # type: ignore[arg-type]
     fabric.launch()
     return fabric

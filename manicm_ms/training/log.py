@@ -8,6 +8,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from types import TracebackType
+from typing import Any
 
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
@@ -67,7 +68,8 @@ class LossBar:
 
     def update(self, step: int, loss: float | None = None) -> None:
         """Show that `step` steps are done."""
-        self._progress.update(self._task, completed=step, **({} if loss is None else {"loss": loss}))
+        shown: dict[str, Any] = {} if loss is None else {"loss": loss}
+        self._progress.update(self._task, completed=step, **shown)
 
 
 @contextmanager

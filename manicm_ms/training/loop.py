@@ -5,7 +5,8 @@ from __future__ import annotations
 import math
 import time
 from abc import ABC, abstractmethod
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
 from dataclasses import dataclass
 from typing import Any, ClassVar, Protocol
 
@@ -115,7 +116,7 @@ class _Training:
         self.loss = float(self.loss_sum) / self.loss_count
         self.loss_sum.zero_()
         self.loss_count = 0
-        return {"loss": self.loss, "learning_rate": self.scheduler.get_last_lr()[0], "seconds": self.seconds}
+        return {"loss": self.loss, "learning_rate": float(self.scheduler.get_last_lr()[0]), "seconds": self.seconds}
 
     def save(self, run: RunFolder) -> None:
         """Write the training state; never one with a loss that is not finite."""
@@ -203,6 +204,30 @@ def fit(
     """
     if fabric.device.type == "cpu":
         keep_freed_memory()
+    with _threads(config.threads):
+        return _fit(objective, data, config, run, fabric, seed, console, title)
+
+
+@contextmanager
+def _threads(count: int) -> Iterator[None]:
+    before = torch.get_num_threads()
+    torch.set_num_threads(count)
+    try:
+        yield
+    finally:
+        torch.set_num_threads(before)
+
+
+def _fit(
+    objective: Objective,
+    data: Batches,
+    config: FitConfig,
+    run: RunFolder,
+    fabric: Fabric,
+    seed: int,
+    console: Console | None,
+    title: str,
+) -> FitResult:
     steps = config.total_steps(len(data))
     training = _Training(objective, config, steps, fabric)
     training.restore(run)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from abc import abstractmethod
 from collections.abc import Mapping
+from typing import cast
 
 import torch
 from torch import Tensor
@@ -64,7 +65,7 @@ class DiffusionObjective(PolicyObjective):
     @property
     def outcome(self) -> DiffusionPolicy:
         """The policy with averaged weights."""
-        return self.average.module
+        return cast(DiffusionPolicy, self.average.module)
 
 
 class Distillation(PolicyObjective):
@@ -103,14 +104,14 @@ class Distillation(PolicyObjective):
         rows, subsets, _ = batch[COND].shape
         subset = torch.randint(subsets, (rows,), generator=generator, device=device)
         cond = batch[COND][torch.arange(rows, device=device), subset]  # (B, F)
-        solver = self.solver()
+        solver, follower = self.solver(), cast(ManiCM, self.target.module)
         index = torch.randint(len(solver), (rows,), generator=generator, device=device)
         epsilon = torch.randn(x0.shape, generator=generator, device=device)
         prediction, wanted = consistency_pair(
             solver,
             teacher=lambda x_t, t: self.teacher_x0(x_t, t, cond),
             online=lambda x_t, t: self.student.consistency_function(x_t, t, cond),
-            target=lambda x_t, t: self.target.module.consistency_function(x_t, t, cond),
+            target=lambda x_t, t: follower.consistency_function(x_t, t, cond),
             x_t=self.teacher.add_noise(x0, epsilon, solver.timesteps[index]),
             index=index,
         )

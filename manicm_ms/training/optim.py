@@ -29,6 +29,9 @@ class FitConfig:
         betas: AdamW's; (0.95, 0.999) as diffusion_policy and DP3 have it.
         weight_decay: AdamW's.
         clip_norm: largest 2-norm of the gradient, or None for no clipping.
+        threads: CPU threads of the tensor library while training. One is the default: the products of a small
+            network gain little from more, lose much where cores are shared, and the bits of the result would
+            depend on the number of cores.
         log_every: steps between lines of the log; also how often the loss is checked for NaN.
         save_every: steps between saved training states, which is what a kill can cost.
     """
@@ -41,6 +44,7 @@ class FitConfig:
     betas: tuple[float, float] = (0.95, 0.999)
     weight_decay: float = 1e-6
     clip_norm: float | None = 1.0
+    threads: int = 1
     log_every: int = 10
     save_every: int = 250
 
@@ -48,8 +52,8 @@ class FitConfig:
         if (self.steps is None) == (self.epochs is None):
             raise ConfigError(f"give steps or epochs, one of the two: got steps={self.steps}, epochs={self.epochs}")
         length = self.steps if self.epochs is None else self.epochs
-        if min(length or 0, self.batch_size, self.log_every, self.save_every) < 1:
-            raise ConfigError("steps or epochs, batch_size, log_every and save_every must be at least 1")
+        if min(length or 0, self.batch_size, self.threads, self.log_every, self.save_every) < 1:
+            raise ConfigError("steps or epochs, batch_size, threads, log_every and save_every must be at least 1")
         if self.warmup_steps < 0 or self.learning_rate <= 0 or self.weight_decay < 0:
             raise ConfigError("learning_rate must be positive, warmup_steps and weight_decay not negative")
         if self.steps is not None and self.warmup_steps >= self.steps:
@@ -78,6 +82,8 @@ def build_scheduler(optimizer: torch.optim.Optimizer, config: FitConfig, steps: 
         "cosine", optimizer, num_warmup_steps=min(config.warmup_steps, steps), num_training_steps=steps
     )
 
+
+Tensors = tuple[Tensor, ...] | list[Tensor]
 
 DecayRule = Callable[[int], float]
 """Number of averages taken before -> share of the old average that is kept, in [0, 1]."""
@@ -129,7 +135,7 @@ def averaged(module: nn.Module, rule: DecayRule) -> AveragedModel:
     `.update_parameters(module)` takes one step, `.module` is the averaged copy; nothing in it asks for a gradient.
     """
 
-    def average(old: list[Tensor], new: list[Tensor], count: Tensor) -> None:
+    def average(old: Tensors, new: Tensors, count: Tensor | int) -> None:
         torch._foreach_lerp_(old, new, 1.0 - rule(int(count) - 1))
 
     copy = AveragedModel(module, multi_avg_fn=average)

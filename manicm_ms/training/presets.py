@@ -2,22 +2,12 @@
 
 from __future__ import annotations
 
-import json
-from dataclasses import asdict, dataclass
-from typing import Any
+from dataclasses import dataclass
 
 from manicm_ms.errors import ConfigError
 from manicm_ms.registry import Registry
 from manicm_ms.training.optim import FitConfig
 from manicm_ms.types import ChunkSpec
-
-_NOT_IDENTITY = ("log_every", "save_every")
-
-
-def identity(preset: FitConfig) -> dict[str, Any]:
-    """Return the fields that decide the trained weights, as JSON values."""
-    fields = {k: v for k, v in asdict(preset).items() if k not in _NOT_IDENTITY}
-    return json.loads(json.dumps(fields))
 
 
 @dataclass(frozen=True, kw_only=True)

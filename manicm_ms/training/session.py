@@ -1,0 +1,212 @@
+"""From demonstrations to a checkpoint, once: what teachers and students have in common around the loop."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import shlex
+import sys
+from collections.abc import Callable, Mapping
+from contextlib import AbstractContextManager, nullcontext
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+from lightning_fabric import Fabric
+from rich.console import Console
+
+from manicm_ms.demos.stats import FieldStats, store_stats
+from manicm_ms.demos.store import DemoStore
+from manicm_ms.demos.windows import Windows
+from manicm_ms.errors import CheckpointError, OutputExistsError
+from manicm_ms.policies.checkpoint import read_manifest, save_checkpoint
+from manicm_ms.training.device import make_fabric, resolve_device, resolve_precision
+from manicm_ms.training.loop import Batches, FitResult, fit
+from manicm_ms.training.objectives import PolicyObjective
+from manicm_ms.training.optim import FitConfig
+from manicm_ms.training.run_folder import RunFolder, open_run, training_folder
+from manicm_ms.types import ChunkSpec, EnvSpec
+
+_NOT_IDENTITY = ("log_every", "save_every", "precision")  # the precision that is used stands beside the preset
+
+
+@dataclass(frozen=True)
+class Demos:
+    """A store of demonstrations, read for training.
+
+    Attributes:
+        spec: of the environment that they come from.
+        windows: all of them, on the CPU.
+        stats: ranges of `point_cloud`, `agent_pos` and `action`.
+        provenance: path, content hash, sizes, and the store's own provenance, JSON values.
+    """
+
+    spec: EnvSpec
+    windows: Windows
+    stats: Mapping[str, FieldStats]
+    provenance: dict[str, Any]
+
+
+def read_demos(path: Path, chunk: ChunkSpec) -> Demos:
+    """Read a store; raise StoreError where there is none or it is damaged or empty."""
+    with DemoStore.open(path) as store:
+        stats = store_stats(store)
+        windows = Windows.from_store(store, chunk)
+        digest = hashlib.sha256()
+        for tensor in (windows.point_cloud, windows.agent_pos, windows.action, windows.index):
+            digest.update(tensor.numpy().tobytes())
+        provenance = {
+            "path": str(path),
+            "env_id": store.spec.env_id,
+            "episodes": len(store),
+            "frames": len(windows.action),
+            "windows": len(windows),
+            "sha256": digest.hexdigest(),
+            "collection": store.provenance,
+        }
+        return Demos(store.spec, windows, stats, provenance)
+
+
+@dataclass(frozen=True)
+class Session:
+    """One training: where it runs, what it makes and where that goes.
+
+    Attributes:
+        kind: "teacher" or "student", for messages.
+        out: checkpoint folder to write.
+        preset: all fields of the recipe.
+        precision: the one used, resolved.
+        seed: of weights, batches and noise.
+        fabric: device and processes, launched.
+        console: for progress and messages.
+        command: the command line that this is, for the record.
+    """
+
+    kind: str
+    out: Path
+    preset: FitConfig
+    precision: str
+    seed: int
+    fabric: Fabric
+    console: Console
+    command: str
+
+    @classmethod
+    def start(
+        cls,
+        kind: str,
+        out: Path,
+        preset: FitConfig,
+        *,
+        device: str,
+        precision: str,
+        seed: int,
+        num_devices: int,
+        console: Console | None,
+        command: str | None,
+    ) -> Session:
+        """Resolve device and precision and launch the processes; raise ConfigError where they do not exist."""
+        place = resolve_device(device)
+        used = resolve_precision(precision, place)
+        line = command if command is not None else shlex.join([Path(sys.argv[0]).name, *sys.argv[1:]])
+        fabric = make_fabric(place, used, num_devices)
+        return cls(kind, Path(out), preset, used, seed, fabric, console or Console(stderr=True), line)
+
+    def complete(
+        self,
+        inputs: Mapping[str, Any],
+        provenance: Mapping[str, Any],
+        build: Callable[[], tuple[PolicyObjective, Batches]],
+    ) -> Path:
+        """Train and write the checkpoint, or go on with what an earlier process left, or find it all done.
+
+        Args:
+            inputs: what decides the weights beside preset, precision and seed, JSON values.
+            provenance: of the inputs, for the checkpoint.
+            build: makes objective and data, the same at each call.
+
+        Returns:
+            The checkpoint folder.
+
+        Raises:
+            OutputExistsError: `out` holds another run or something else.
+            NoSpaceError, TrainingDivergedError: see `fit`.
+        """
+        identity = {
+            "kind": self.kind,
+            **inputs,
+            "preset": {k: v for k, v in asdict(self.preset).items() if k not in _NOT_IDENTITY},
+            "precision": self.precision,
+            "seed": self.seed,
+        }
+        with self._open(identity) as run:
+            done = _is_done(run)
+            self.fabric.barrier()  # all ranks have looked before rank 0 writes
+            if done:
+                self._say(f"{self.out} is finished: nothing to do")
+                return self.out
+            objective, data = build()
+            try:
+                result = fit(
+                    objective,
+                    data,
+                    self.preset,
+                    run,
+                    self.fabric,
+                    seed=self.seed,
+                    console=self.console,
+                    title=f"{self.kind} {self.out.name}",
+                )
+            except KeyboardInterrupt:
+                self._say(f"training state saved in {run.folder}")
+                raise
+            if self.fabric.is_global_zero:
+                save_checkpoint(objective.outcome, self.out, self._record(run, result, provenance))
+                run.drop_state()
+            self.fabric.barrier()
+        self._say(f"{self.out}: {result.steps} steps in {result.seconds:.0f} s, loss {result.loss:.4g}")
+        return self.out
+
+    def _open(self, identity: Mapping[str, Any]) -> AbstractContextManager[RunFolder]:
+        if not self.fabric.is_global_zero:
+            return nullcontext(RunFolder(self.out, identity))
+        if not (training_folder(self.out) / "run.json").exists():
+            _is_done(RunFolder(self.out, identity))  # refuses what is not ours before anything is written beside it
+        return open_run(self.out, identity)
+
+    def _record(self, run: RunFolder, result: FitResult, provenance: Mapping[str, Any]) -> dict[str, Any]:
+        """Return what a checkpoint says about its making."""
+        return {
+            "run": run.fingerprint,
+            "kind": self.kind,
+            "command": self.command,
+            "steps": result.steps,
+            "final_loss": result.loss,
+            "seconds": round(result.seconds, 1),
+            "seed": self.seed,
+            "device": str(self.fabric.device),
+            "precision": self.precision,
+            "preset": json.loads(json.dumps(asdict(self.preset))),
+            **provenance,
+        }
+
+    def _say(self, line: str) -> None:
+        if self.fabric.is_global_zero:
+            self.console.print(line, highlight=False, soft_wrap=True)
+
+
+def _is_done(run: RunFolder) -> bool:
+    """Return whether the checkpoint of this run stands; raise OutputExistsError where another's does."""
+    if not run.out.exists() or (run.out.is_dir() and not any(run.out.iterdir())):
+        return False
+    try:
+        maker = read_manifest(run.out)["provenance"].get("run")
+    except CheckpointError as e:
+        raise OutputExistsError(
+            f"{run.out} already holds something else: choose another --out, or delete it first"
+        ) from e
+    if maker != run.fingerprint:
+        raise OutputExistsError(
+            f"{run.out} already holds another run's checkpoint: choose another --out, or delete it first"
+        )
+    return True

@@ -1,0 +1,94 @@
+"""Distils a teacher into a one-step student: the work of `manicm-ms distill`."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from rich.console import Console
+
+from manicm_ms.errors import CheckpointError, ConfigError
+from manicm_ms.policies.checkpoint import load_checkpoint, read_manifest
+from manicm_ms.policies.diffusion import DiffusionPolicy
+from manicm_ms.policies.manicm import ManiCM
+from manicm_ms.training.features import encode_windows
+from manicm_ms.training.loop import Batches
+from manicm_ms.training.objectives import DISTILLATIONS, PolicyObjective
+from manicm_ms.training.presets import StudentPreset
+from manicm_ms.training.session import Session, read_demos
+from manicm_ms.types import require_compatible
+
+
+def distill(
+    teacher: Path,
+    data: Path,
+    out: Path,
+    preset: StudentPreset,
+    *,
+    device: str = "auto",
+    precision: str | None = None,
+    seed: int = 0,
+    num_devices: int = 1,
+    console: Console | None = None,
+    command: str | None = None,
+) -> Path:
+    """Distil a teacher and write the student's checkpoint; the same call goes on after a kill.
+
+    The student starts from the teacher's averaged weights and keeps its encoder and normaliser.
+
+    Args:
+        teacher: checkpoint folder of a diffusion policy.
+        data: store of demonstrations, as a rule the one that the teacher was trained on.
+        out: checkpoint folder to write; state and logs go to `<out>.train`.
+        preset: the recipe.
+        device: "auto", "cpu", "cuda", "cuda:1".
+        precision: one of `PRECISIONS`; None takes the preset's.
+        seed: of point subsets, batches and noise.
+        num_devices: devices that share each batch.
+        console: for progress; standard error by default.
+        command: the command line, for the record; this process's by default.
+
+    Returns:
+        `out`.
+
+    Raises:
+        CheckpointError: the teacher is missing, damaged, or not a diffusion policy.
+        SpecMismatchError: data and teacher were made for different observations or actions.
+        ManicmError: unfit configuration, damaged store, another run in `out`, full disk, NaN loss.
+    """
+    teacher, objective_type = Path(teacher), DISTILLATIONS.get(preset.objective)
+    policy = load_checkpoint(teacher)
+    if not isinstance(policy, DiffusionPolicy):
+        raise CheckpointError(f"{teacher} holds a {policy.name}, which cannot be distilled: give a diffusion teacher")
+    demos = read_demos(data, policy.chunk)
+    require_compatible(demos.spec, policy.spec, f"the data {data}", f"the teacher {teacher}")
+    student = ManiCM.from_teacher(policy, nfe=preset.nfe, num_solver_steps=_solver_steps(policy, preset.skip))
+    manifest = read_manifest(teacher)
+    session = Session.start(
+        "student",
+        out,
+        preset,
+        device=device,
+        precision=precision or preset.precision,
+        seed=seed,
+        num_devices=num_devices,
+        console=console,
+        command=command,
+    )
+
+    def build() -> tuple[PolicyObjective, Batches]:
+        network = policy.network.to(session.fabric.device)
+        features = encode_windows(network, demos.windows.to(session.fabric.device), preset.draws, seed)
+        return objective_type(policy, student, preset.mu), features
+
+    weights = manifest["files"]["model.safetensors"]["sha256"]
+    inputs = {"teacher": weights, "data": demos.provenance["sha256"]}
+    made_from = {"path": str(teacher), "sha256": weights, "provenance": manifest["provenance"]}
+    return session.complete(inputs, {"data": demos.provenance, "teacher": made_from}, build)
+
+
+def _solver_steps(teacher: DiffusionPolicy, skip: int) -> int:
+    """Return the grid points of a solver that spans `skip` of the teacher's timesteps at a time."""
+    timesteps = teacher.diffusion.num_train_timesteps
+    if timesteps % skip:
+        raise ConfigError(f"skip={skip} must divide the teacher's {timesteps} timesteps: try 10")
+    return timesteps // skip
