@@ -20,6 +20,7 @@ from manicm_ms.envs.maniskill import ManiSkillSimulator
 from manicm_ms.envs.simulator import ENVS, EnvEntry
 from manicm_ms.envs.ur3e_tabletop import SPAWN_CLEARANCE, UR3eTabletopEnv, pose_error, ur3e_spec
 from manicm_ms.errors import UnknownNameError
+from manicm_ms.robots.limits import pose_in_frame
 from manicm_ms.types import EnvSpec
 
 ENV_ID, GYM_ID = "ur3e/slide-block", "UR3eSlideBlock-v1"
@@ -79,11 +80,12 @@ class SlideBlockEnv(UR3eTabletopEnv):
 
     def evaluate(self) -> dict[str, Tensor]:
         """Return per-row booleans (N,): success, fail, block_fallen, block_fell_wrong, cube_moved, still."""
-        centre = self.block.pose.p
-        in_cube = (self.cube.pose.inv() * self.block.pose).p
+        block, cube = self.block.pose.raw_pose, self.cube.pose
+        centre = block[:, :3]
+        in_cube = pose_in_frame(block, cube.raw_pose)
         beside = (in_cube[:, :2].abs() > CUBE_HALF).any(dim=1)
         fallen = (centre[:, 2] > 0) & (centre[:, 2] < FALLEN_HEIGHT) & beside
-        shift, tilt = pose_error(self.cube.pose, Pose.create(self.cube_start))
+        shift, tilt = pose_error(cube, Pose.create(self.cube_start))
         moved = (shift > MAX_CUBE_SHIFT) | (tilt > MAX_CUBE_TILT)
         still = self.cube.is_static(STILL_SPEED, STILL_TURN) & self.block.is_static(STILL_SPEED, STILL_TURN)
         off_table = centre[:, 2] < 0

@@ -25,6 +25,8 @@ from manicm_ms.types import AGENT_POS, DEPTH, IMAGE, POINT_CLOUD, STATE, EnvSpec
 
 VIDEO_SHADER = "default"
 _RENDERED = {POINT_CLOUD, IMAGE, DEPTH}
+_NO_VULKAN = ("failed to find a rendering device", "vk::")
+"""How SAPIEN words it when no driver, or no device that can render, is there."""
 
 
 class ManiSkillSimulator(Simulator):
@@ -44,6 +46,7 @@ class ManiSkillSimulator(Simulator):
         self.env = _make(gym_id, spec, config)
         self.device = self.env.device
         self._camera = self.env._sensors["d435i"]
+        self._T_base_camera: Tensor | None = None  # (n, 4, 4); base and camera stand still during an episode
         self._closed = False
 
     def reset(self, rows: Tensor, seeds: Sequence[int]) -> None:
@@ -51,6 +54,7 @@ class ManiSkillSimulator(Simulator):
         every = np.zeros(self.num_rows, dtype=np.int64)  # rows that are not reset never draw from their seed
         every[rows.cpu().numpy()] = np.asarray(seeds, dtype=np.int64)
         self.env.reset(seed=every.tolist(), options={"env_idx": rows.to(self.device)})
+        self._T_base_camera = None
 
     def step(self, actions: Tensor) -> StepResult:
         """See `Simulator.step`."""
@@ -96,9 +100,11 @@ class ManiSkillSimulator(Simulator):
         n = len(position)
         xyz = position[..., :3].reshape(n, -1, 3) * MICROMETRE
         hit = position[..., 3].reshape(n, -1) != 0  # the background carries segmentation id 0
-        T_world_camera = self._camera.camera.get_model_matrix()
-        T_base_world = self.env.agent.robot.pose.inv().to_transformation_matrix()
-        xyz = transform(xyz, (T_base_world @ T_world_camera).float())
+        if self._T_base_camera is None:
+            T_world_camera = self._camera.camera.get_model_matrix()
+            T_base_world = self.env.agent.robot.pose.inv().to_transformation_matrix()
+            self._T_base_camera = (T_base_world @ T_world_camera).float()
+        xyz = transform(xyz, self._T_base_camera)
         valid = hit & inside(xyz, self.env.workspace)
         points = xyz if color is None else torch.cat([xyz, color[..., :3].reshape(n, -1, 3) / 255.0], dim=-1)
         if self.device.type != "cpu":
@@ -135,7 +141,7 @@ def _make(gym_id: str, spec: EnvSpec, config: SimulatorConfig) -> UR3eTabletopEn
     try:
         env = gymnasium.make(gym_id, **options)
     except RuntimeError as error:
-        if "rendering device" not in str(error):
+        if not any(words in str(error) for words in _NO_VULKAN):
             raise
         raise RenderDeviceError(
             "SAPIEN found no Vulkan device to render with: run 'make setup' to install one, then 'manicm-ms doctor'"

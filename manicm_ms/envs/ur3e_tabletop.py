@@ -18,6 +18,7 @@ from torch import Tensor
 
 from manicm_ms.envs.cameras import D435I, WIDE, FixedCamera
 from manicm_ms.point_cloud import Box
+from manicm_ms.robots.limits import quat_rotate
 from manicm_ms.robots.ur3e_ag95 import UR3eAG95
 from manicm_ms.types import ActionSpec, EnvSpec, ObsSpec
 
@@ -218,7 +219,8 @@ def _camera_config(uid: str, camera: FixedCamera) -> CameraConfig:
 
 def pose_error(actor_pose: Pose, reference: Pose) -> tuple[Tensor, Tensor]:
     """Return how far poses (N,) stand from their references: distance (N,) m, and tilt of the z axis (N,) rad."""
-    distance = (actor_pose.p - reference.p).norm(dim=1)
-    z_now = quaternion_to_matrix(actor_pose.q)[:, :, 2]
-    z_then = quaternion_to_matrix(reference.q)[:, :, 2]
-    return distance, torch.acos((z_now * z_then).sum(dim=1).clamp(-1, 1))
+    now, then = actor_pose.raw_pose, reference.raw_pose
+    distance = (now[:, :3] - then[:, :3]).norm(dim=1)
+    up = now.new_tensor([[0.0, 0.0, 1.0]]).expand(len(now), -1)
+    cosine = (quat_rotate(now[:, 3:], up) * quat_rotate(then[:, 3:], up)).sum(dim=1)
+    return distance, torch.acos(cosine.clamp(-1, 1))
