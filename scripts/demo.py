@@ -20,12 +20,13 @@ EPISODES, FRESH_EPISODES, FRESH_SEED = "10", "50", "100000"
 def steps() -> list[list[str]]:
     """Return the commands, in order."""
     data, teacher, student, report = (str(FOLDER / name) for name in ("demos.zarr", "teacher", "student", "report"))
+    fresh = ["--episodes", FRESH_EPISODES, "--seed", FRESH_SEED]
     return [
         ["collect", ENV_ID, "--episodes", EPISODES, "--seed", "0", "--out", data],
         ["train", "simple_dp3", "--data", data, "--out", teacher, "--preset", "quick"],
         ["distill", "--teacher", teacher, "--data", data, "--out", student, "--preset", "quick"],
-        ["evaluate", teacher, student, "--env", ENV_ID, "--episodes", FRESH_EPISODES, "--seed", FRESH_SEED, "--out", report],
-    ]  # fmt: skip
+        ["evaluate", teacher, student, "--env", ENV_ID, *fresh, "--out", report],
+    ]
 
 
 def main() -> int:

@@ -6,10 +6,12 @@ import functools
 import multiprocessing
 import os
 from abc import abstractmethod
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
+import gymnasium
 import numpy as np
 import torch
 from gymnasium.vector import AsyncVectorEnv, AutoresetMode, VectorEnv
@@ -181,7 +183,8 @@ class CpuVecEnv(VecEnv):
 
     def _guarded(self, call: Any, *args: Any, **kwargs: Any) -> Any:
         try:
-            return call(*args, **kwargs)
+            with _quiet_gymnasium():
+                return call(*args, **kwargs)
         except _DEAD_WORKER as error:
             dead = [k for k, process in enumerate(self._workers.processes) if not process.is_alive()]
             codes = [self._workers.processes[k].exitcode for k in dead]
@@ -325,6 +328,17 @@ def _gpu_obstacle() -> str | None:
             "python -c 'import sapien; sapien.physx.enable_gpu()' once while online"
         )
     return None
+
+
+@contextmanager
+def _quiet_gymnasium() -> Iterator[None]:
+    """Keep Gymnasium from logging a worker's traceback: the exception that it raises here says the same."""
+    level = gymnasium.logger.min_level
+    gymnasium.logger.min_level = gymnasium.logger.ERROR + 1
+    try:
+        yield
+    finally:
+        gymnasium.logger.min_level = level
 
 
 def _require_video(video: bool) -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import importlib
+import traceback
 from typing import Any
 
 import gymnasium
@@ -12,6 +13,7 @@ from gymnasium import spaces
 
 from manicm_ms.envs.chunk import ActionChunk
 from manicm_ms.envs.simulator import ENVS, SimulatorConfig
+from manicm_ms.errors import ManicmError
 from manicm_ms.types import AGENT_POS, DEPTH, IMAGE, POINT_CLOUD, STATE, ChunkSpec, EnvSpec
 
 
@@ -62,13 +64,20 @@ class RowEnv(gymnasium.Env[dict[str, np.ndarray], np.ndarray]):
     ) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
         """Start the episode that belongs to `seed` (drawn at random where it is None)."""
         super().reset(seed=seed)
-        if self._rows is None:
-            torch.set_num_threads(1)  # workers share the cores; more threads a worker fight the software renderer
-            simulator = ENVS.get_registered(self._env_id).build(self.env_spec, self._config)
-            self._rows = ActionChunk.from_spec(simulator, self._chunk)
+        self._rows = self._rows or self._build()
         seed = int(self.np_random.integers(2**31)) if seed is None else seed
         history, info = self._rows.reset(torch.zeros(1, dtype=torch.int64), [seed])
         return self._unbatch(history), self._plain(info)
+
+    def _build(self) -> ActionChunk:
+        torch.set_num_threads(1)  # workers share the cores; more threads a worker fight the software renderer
+        try:
+            simulator = ENVS.get_registered(self._env_id).build(self.env_spec, self._config)
+        except ManicmError:
+            raise
+        except Exception as error:  # the parent sees the message alone: let it say where
+            raise RuntimeError(f"building {self._env_id} failed in its worker:\n{traceback.format_exc()}") from error
+        return ActionChunk.from_spec(simulator, self._chunk)
 
     def step(self, action: np.ndarray) -> tuple[dict[str, np.ndarray], float, bool, bool, dict[str, Any]]:
         """Play one action, or a chunk of them."""

@@ -11,7 +11,7 @@ import shlex
 import sys
 from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Any, Literal
 
 import tyro
 
@@ -21,7 +21,6 @@ Backend = Literal["auto", "cpu", "gpu"]
 Command = Callable[..., int | None]
 PROGRAM = "manicm-ms"
 USER_ERROR, INTERRUPTED = 2, 130
-PRESETS_DEFAULT = "quick"
 
 
 def list_command(kind: tyro.conf.Positional[Literal["envs", "policies", "presets"]], tag: str | None = None) -> None:
@@ -33,7 +32,7 @@ def list_command(kind: tyro.conf.Positional[Literal["envs", "policies", "presets
     """
     from rich.console import Console
 
-    from manicm_ms import listing
+    from manicm_ms.cli import listing
 
     tables = {"envs": lambda: listing.envs(tag), "policies": listing.policies, "presets": listing.presets}
     Console().print(tables[kind]())
@@ -142,7 +141,7 @@ def evaluate_command(
 
     evaluate(
         _at_least_one(checkpoints, "checkpoint folder"), env, episodes, seed, out, num_envs=num_envs, backend=backend,
-        device=device, control=control, videos=videos, threads=threads, command=_this_command(),
+        device=device, control=control, videos=videos, threads=threads, command=this_command(),
     )  # fmt: skip
 
 
@@ -151,74 +150,6 @@ def doctor_command() -> int:
     from manicm_ms.doctor import doctor
 
     return doctor()
-
-
-def train_command() -> Command:
-    """Train a diffusion teacher on demonstrations; the same command goes on after Ctrl-C or a kill."""
-    from manicm_ms.policies.base import POLICIES
-    from manicm_ms.training.presets import TEACHER_PRESETS, TeacherPreset
-    from manicm_ms.training.teacher import train_teacher
-
-    default = TEACHER_PRESETS.get(_preset_asked())
-
-    def train(
-        policy: tyro.conf.Positional[str],
-        data: Path,
-        out: Path,
-        recipe: Annotated[TeacherPreset, tyro.conf.arg(name="")] = default,
-        preset: str = PRESETS_DEFAULT,
-        device: str = "auto",
-        seed: int = 0,
-    ) -> None:
-        POLICIES.get(policy)
-        train_teacher(policy, data, out, recipe, device=device, precision=recipe.precision, seed=seed)
-
-    return _documented(
-        train,
-        train_command,
-        {
-            "policy": "dp3 or simple_dp3.",
-            "data": "store of demonstrations.",
-            "out": "checkpoint folder to write.",
-            "recipe": "the preset's fields; each can be overridden.",
-            "preset": f"recipe to start from: {', '.join(TEACHER_PRESETS.names())}.",
-            "device": "torch device; auto takes an accelerator where there is one.",
-            "seed": "of weights, batches and noise.",
-        },
-    )
-
-
-def distill_command() -> Command:
-    """Distil a teacher into a one-step ManiCM student; the same command goes on after Ctrl-C or a kill."""
-    from manicm_ms.training.presets import STUDENT_PRESETS, StudentPreset
-    from manicm_ms.training.student import distill as distill_student
-
-    default = STUDENT_PRESETS.get(_preset_asked())
-
-    def distill(
-        teacher: Path,
-        data: Path,
-        out: Path,
-        recipe: Annotated[StudentPreset, tyro.conf.arg(name="")] = default,
-        preset: str = PRESETS_DEFAULT,
-        device: str = "auto",
-        seed: int = 0,
-    ) -> None:
-        distill_student(teacher, data, out, recipe, device=device, precision=recipe.precision, seed=seed)
-
-    return _documented(
-        distill,
-        distill_command,
-        {
-            "teacher": "checkpoint folder of the teacher.",
-            "data": "the store that the teacher was trained on.",
-            "out": "checkpoint folder to write.",
-            "recipe": "the preset's fields; each can be overridden.",
-            "preset": f"recipe to start from: {', '.join(STUDENT_PRESETS.names())}.",
-            "device": "torch device; auto takes an accelerator where there is one.",
-            "seed": "of batches and noise.",
-        },
-    )
 
 
 _PLAIN: dict[str, Command] = {
@@ -230,7 +161,10 @@ _PLAIN: dict[str, Command] = {
     "doctor": doctor_command,
 }
 # These depend on the preset that the command line names: its fields become options with its values as defaults.
-_WITH_PRESET: dict[str, Callable[[], Command]] = {"train": train_command, "distill": distill_command}
+_WITH_PRESET = {
+    "train": "Train a diffusion teacher on demonstrations; the same command goes on after Ctrl-C or a kill.",
+    "distill": "Distil a teacher into a one-step ManiCM student; the same command goes on after Ctrl-C or a kill.",
+}
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
@@ -262,40 +196,28 @@ def _run(arguments: list[str]) -> int | None:
         print(__version__)
         return 0
     name, rest = arguments[0], arguments[1:]
-    known = {**_PLAIN, **_WITH_PRESET}
-    if name not in known:
-        raise UnknownNameError("command", name, known)
-    command = _WITH_PRESET[name]() if name in _WITH_PRESET else _PLAIN[name]
+    if name not in (*_PLAIN, *_WITH_PRESET):
+        raise UnknownNameError("command", name, (*_PLAIN, *_WITH_PRESET))
+    command = _training_command(name, rest) if name in _WITH_PRESET else _PLAIN[name]
     return tyro.cli(command, prog=f"{PROGRAM} {name}", args=rest, config=(tyro.conf.OmitArgPrefixes,))
+
+
+def _training_command(name: str, arguments: list[str]) -> Command:
+    from manicm_ms.cli import training  # torch and the presets: a second that the other commands need not wait
+
+    return {"train": training.train_command, "distill": training.distill_command}[name](arguments)
 
 
 def _overview() -> None:
     print(f"usage: {PROGRAM} COMMAND ...   ('{PROGRAM} COMMAND --help' tells more)\n")
-    for name, command in {**_PLAIN, **_WITH_PRESET}.items():
-        print(f"  {name:<9} {(command.__doc__ or '').splitlines()[0]}")
+    plain = {name: (command.__doc__ or "").splitlines()[0] for name, command in _PLAIN.items()}
+    for name, summary in {**plain, **_WITH_PRESET}.items():
+        print(f"  {name:<9} {summary}")
 
 
 def _complain(message: str) -> int:
     print(f"{PROGRAM}: {' '.join(message.split())}", file=sys.stderr)
     return USER_ERROR
-
-
-def _preset_asked() -> str:
-    """Return the preset that the command line names: known before parsing, because the options depend on it."""
-    words = sys.argv[1:]
-    for k, word in enumerate(words):
-        if word == "--preset" and k + 1 < len(words):
-            return words[k + 1]
-        if word.startswith("--preset="):
-            return word.removeprefix("--preset=")
-    return PRESETS_DEFAULT
-
-
-def _documented(command: Command, source: Callable[..., Any], arguments: dict[str, str]) -> Command:
-    """Give `command` the docstring of `source` and a description of each argument, in the form that tyro reads."""
-    lines = [f"    {name}: {text}" for name, text in arguments.items()]
-    command.__doc__ = "\n".join([(source.__doc__ or "").strip(), "", "Args:", *lines])
-    return command
 
 
 def _at_least_one(values: tuple[Any, ...], what: str) -> tuple[Any, ...]:
@@ -304,9 +226,6 @@ def _at_least_one(values: tuple[Any, ...], what: str) -> tuple[Any, ...]:
     return values
 
 
-def _this_command() -> str:
+def this_command() -> str:
+    """Return the command line as the user gave it, for provenance."""
     return shlex.join([PROGRAM, *sys.argv[1:]])
-
-
-if __name__ == "__main__":
-    main()

@@ -1,0 +1,86 @@
+"""`manicm-ms train` and `distill`: the fields of the named preset are options, its values their defaults."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Annotated
+
+import tyro
+
+from manicm_ms.cli import this_command
+from manicm_ms.training.presets import STUDENT_PRESETS, TEACHER_PRESETS, StudentPreset, TeacherPreset
+
+DEFAULT_PRESET = "quick"
+
+
+def train_command(arguments: Sequence[str]) -> Callable[..., None]:
+    """Return the command `train` with the preset that `arguments` name."""
+    default = TEACHER_PRESETS.get(_preset_asked(arguments))
+
+    def train(
+        policy: tyro.conf.Positional[str],
+        data: Path,
+        out: Path,
+        recipe: Annotated[TeacherPreset, tyro.conf.arg(name="")] = default,
+        preset: str = DEFAULT_PRESET,
+        device: str = "auto",
+        seed: int = 0,
+    ) -> None:
+        """Train a diffusion teacher on demonstrations; the same command goes on after Ctrl-C or a kill.
+
+        Args:
+            policy: dp3 or simple_dp3.
+            data: store of demonstrations.
+            out: checkpoint folder to write; state and logs go beside it, to OUT.train.
+            recipe: the preset's fields, each of which can be overridden.
+            preset: recipe to start from; `manicm-ms list presets` shows them.
+            device: torch device; auto takes an accelerator where there is one.
+            seed: of weights, batches and noise.
+        """
+        from manicm_ms.training.teacher import train_teacher
+
+        train_teacher(policy, data, out, recipe, device=device, seed=seed, command=this_command())
+
+    return train
+
+
+def distill_command(arguments: Sequence[str]) -> Callable[..., None]:
+    """Return the command `distill` with the preset that `arguments` name."""
+    default = STUDENT_PRESETS.get(_preset_asked(arguments))
+
+    def distill(
+        teacher: Path,
+        data: Path,
+        out: Path,
+        recipe: Annotated[StudentPreset, tyro.conf.arg(name="")] = default,
+        preset: str = DEFAULT_PRESET,
+        device: str = "auto",
+        seed: int = 0,
+    ) -> None:
+        """Distil a teacher into a one-step ManiCM student; the same command goes on after Ctrl-C or a kill.
+
+        Args:
+            teacher: checkpoint folder of the teacher.
+            data: the store that the teacher was trained on.
+            out: checkpoint folder to write; state and logs go beside it, to OUT.train.
+            recipe: the preset's fields, each of which can be overridden.
+            preset: recipe to start from; `manicm-ms list presets` shows them.
+            device: torch device; auto takes an accelerator where there is one.
+            seed: of batches and noise.
+        """
+        from manicm_ms.training.student import distill as distill_student
+
+        distill_student(teacher, data, out, recipe, device=device, seed=seed, command=this_command())
+
+    return distill
+
+
+def _preset_asked(arguments: Sequence[str]) -> str:
+    """Return the preset that the command line names: known before parsing, because the defaults depend on it."""
+    for k, word in enumerate(arguments):
+        if word == "--preset" and k + 1 < len(arguments):
+            return arguments[k + 1]
+        if word.startswith("--preset="):
+            return word.removeprefix("--preset=")
+    return DEFAULT_PRESET
