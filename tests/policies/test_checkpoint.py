@@ -1,0 +1,270 @@
+import json
+import os
+import shutil
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+import torch
+from policy_specs import CHUNK, TINY, make_obs, make_spec, wobble
+from safetensors.torch import load_file, save_file
+
+from manicm_ms.demos.stats import FieldStats
+from manicm_ms.errors import CheckpointError, ConfigError, OutputExistsError
+from manicm_ms.paths import sha256
+from manicm_ms.policies.base import make_policy
+from manicm_ms.policies.checkpoint import load_checkpoint, read_manifest, save_checkpoint, verify_checkpoint
+from manicm_ms.policies.diffusion import OneStepTeacher
+from manicm_ms.policies.manicm import ManiCM
+
+FILES = ("config.json", "model.safetensors", "MODEL_CARD.md")
+PROVENANCE = {"data": "data/slide_block.zarr", "preset": {"steps": 1500}, "seed": 3}
+
+
+def teacher(name="simple_dp3", seed=0, **network):
+    spec = make_spec()
+    sizes = {"point_cloud": 3, "agent_pos": 5, "action": 3}
+    stats = {k: FieldStats(*(torch.full((n,), v).numpy() for v in (-0.7, 0.3, 0.0, 1.0))) for k, n in sizes.items()}
+    config = {"network": TINY["network"] | network}
+    policy = make_policy(name, spec, CHUNK, config, stats=stats, seed=seed)
+    wobble(policy.network.unet)
+    return policy
+
+
+@pytest.fixture
+def folder(tmp_path):
+    save_checkpoint(teacher(), tmp_path / "teacher", PROVENANCE)
+    return tmp_path / "teacher"
+
+
+def act(policy):
+    return policy.act(make_obs(policy.spec, 4), generator=torch.Generator().manual_seed(0))
+
+
+@pytest.mark.parametrize(
+    "make",
+    [
+        teacher,
+        lambda: teacher("dp3"),
+        lambda: teacher(cloud_frame="tcp", max_points=16),
+        lambda: ManiCM.from_teacher(teacher()),
+        lambda: ManiCM.from_teacher(teacher("dp3", cloud_frame="tcp"), nfe=4),
+    ],
+)
+def test_what_is_loaded_acts_as_what_was_saved(tmp_path, make):
+    policy = make()
+    save_checkpoint(policy, tmp_path / "x", PROVENANCE)
+    again = load_checkpoint(tmp_path / "x")
+    assert type(again) is type(policy)
+    assert (again.name, again.spec, again.chunk, again.nfe) == (policy.name, policy.spec, policy.chunk, policy.nfe)
+    assert again.config_dict() == policy.config_dict()
+    assert torch.equal(act(again), act(policy))
+    assert not again.training
+
+
+@pytest.mark.parametrize(("dtype", "error"), [("float16", 2e-2), ("bfloat16", 2e-1)])
+def test_half_precision_halves_the_file_and_keeps_the_normaliser(tmp_path, dtype, error):
+    policy = teacher()
+    save_checkpoint(policy, tmp_path / "full", {})
+    save_checkpoint(policy, tmp_path / "half", {}, dtype=dtype)
+    sizes = [(tmp_path / n / "model.safetensors").stat().st_size for n in ("full", "half")]
+    assert sizes[1] < 0.6 * sizes[0]
+    again = load_checkpoint(tmp_path / "half")
+    assert {v.dtype for v in again.state_dict().values()} == {torch.float32}
+    for key, value in policy.normalizer.state_dict().items():
+        assert torch.equal(value, again.normalizer.state_dict()[key])
+    assert 0 < (act(again) - act(policy)).abs().max() < error
+    assert read_manifest(tmp_path / "half")["weights_dtype"] == dtype
+
+
+def test_the_manifest_tells_what_and_from_where(folder):
+    manifest = read_manifest(folder)
+    assert manifest["policy"] == "simple_dp3"
+    assert manifest["provenance"] == PROVENANCE
+    assert manifest["packages"]["torch"] == torch.__version__
+    assert sorted(p.name for p in folder.iterdir()) == sorted([*FILES, "manifest.json"])
+    for name in FILES:
+        assert manifest["files"][name] == {"sha256": sha256(folder / name), "bytes": (folder / name).stat().st_size}
+
+
+def test_the_model_card_names_task_policy_data_and_licence(folder):
+    card = (folder / "MODEL_CARD.md").read_text()
+    count = sum(p.numel() for p in teacher().parameters())
+    for words in ("simple_dp3", "test/imaginary", "data/slide_block.zarr", "steps: 1500", "MIT", f"{count:,}", "20 Hz"):
+        assert words in card
+
+
+@pytest.mark.parametrize("name", FILES)
+def test_a_truncated_file_is_refused_by_name(folder, name):
+    path = folder / name
+    path.write_bytes(path.read_bytes()[: path.stat().st_size // 2])
+    with pytest.raises(CheckpointError, match=rf"{name} has \d+ bytes.*again"):
+        load_checkpoint(folder)
+
+
+@pytest.mark.parametrize("name", FILES)
+def test_one_altered_bit_is_refused_by_name(folder, name):
+    data = bytearray((folder / name).read_bytes())
+    data[-2] ^= 1
+    (folder / name).write_bytes(bytes(data))
+    with pytest.raises(CheckpointError, match=f"{name} was altered.*again"):
+        load_checkpoint(folder)
+
+
+@pytest.mark.parametrize("name", [*FILES, "manifest.json"])
+def test_a_missing_file_is_refused_by_name(folder, name):
+    (folder / name).unlink()
+    with pytest.raises(CheckpointError, match=name):
+        load_checkpoint(folder)
+
+
+def test_a_missing_folder_is_refused(tmp_path):
+    with pytest.raises(CheckpointError, match="no checkpoint folder .*nowhere"):
+        load_checkpoint(tmp_path / "nowhere")
+
+
+def change_manifest(folder, **changes):
+    path = folder / "manifest.json"
+    path.write_text(json.dumps(json.loads(path.read_text()) | changes))
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"format": "lerobot"}, "foreign"),
+        ({"version": 2}, "format version 2 and this package reads 1"),
+        ({"files": {}}, "does not list"),
+        ({"files": {"../../etc/passwd": {}}}, "does not list"),
+    ],
+)
+def test_a_foreign_manifest_is_refused(folder, changes, message):
+    change_manifest(folder, **changes)
+    with pytest.raises(CheckpointError, match=message):
+        load_checkpoint(folder)
+
+
+@pytest.mark.parametrize("text", ["", "{", "[]", "\x00\xff"])
+def test_a_broken_manifest_is_refused(folder, text):
+    (folder / "manifest.json").write_text(text, encoding="latin-1")
+    with pytest.raises(CheckpointError, match=r"manifest\.json"):
+        load_checkpoint(folder)
+
+
+def sign(folder):
+    """Make the manifest agree with the files, as one who forges a checkpoint would."""
+    change_manifest(
+        folder, files={n: {"sha256": sha256(folder / n), "bytes": (folder / n).stat().st_size} for n in FILES}
+    )
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"policy": "octo"}, "unknown policy 'octo'"),
+        ({"config": {"network": {"colour": 1}}}, "no field colour"),
+        ({"chunk": {"n_obs_steps": 2, "horizon": 4, "n_action_steps": 4}}, "exceeds"),
+        ({"chunk": {"n_obs_steps": 2, "horizon": "four", "n_action_steps": 3}}, "train it anew"),
+        ({"env_spec": {}}, "train it anew"),
+        ({"config": 3}, "train it anew"),
+    ],
+)
+def test_a_configuration_that_this_version_cannot_build_is_refused(folder, change, message):
+    path = folder / "config.json"
+    path.write_text(json.dumps(json.loads(path.read_text()) | change))
+    sign(folder)
+    with pytest.raises(CheckpointError, match=message) as caught:
+        load_checkpoint(folder)
+    assert "config.json" in str(caught.value)
+
+
+def test_weights_of_another_network_are_refused(folder, tmp_path):
+    save_checkpoint(teacher(down_dims=(16, 48)), tmp_path / "other", {})
+    shutil.copy(tmp_path / "other" / "model.safetensors", folder / "model.safetensors")
+    sign(folder)
+    with pytest.raises(CheckpointError, match=r"model\.safetensors does not fit"):
+        load_checkpoint(folder)
+
+
+def test_a_pickle_in_place_of_the_weights_is_refused_and_not_run(folder, tmp_path):
+    class Bomb:
+        def __reduce__(self):
+            return os.mkdir, (str(tmp_path / "bomb"),)
+
+    torch.save({"x": Bomb()}, folder / "model.safetensors")
+    sign(folder)
+    with pytest.raises(CheckpointError, match=r"model\.safetensors cannot be read"):
+        load_checkpoint(folder)
+    assert not (tmp_path / "bomb").exists()
+
+
+def test_a_lost_tensor_is_refused(folder):
+    tensors = load_file(folder / "model.safetensors")
+    tensors.pop("network.normalizer.action_scale")
+    save_file(tensors, folder / "model.safetensors")
+    sign(folder)
+    with pytest.raises(CheckpointError, match=r"network\.normalizer\.action_scale"):
+        load_checkpoint(folder)
+
+
+def test_saving_again_replaces_a_checkpoint_but_nothing_else(folder, tmp_path):
+    save_checkpoint(teacher(seed=1), folder, {})
+    assert torch.equal(act(load_checkpoint(folder)), act(teacher(seed=1)))
+    home = tmp_path / "home"
+    home.mkdir()
+    (home / "thesis.tex").write_text("years of work")
+    with pytest.raises(OutputExistsError, match="home holds something other"):
+        save_checkpoint(teacher(), home, {})
+    with pytest.raises(OutputExistsError, match=r"thesis\.tex holds something other"):
+        save_checkpoint(teacher(), home / "thesis.tex", {})
+    assert (home / "thesis.tex").read_text() == "years of work"
+
+
+def test_what_cannot_be_saved_is_refused_and_the_old_checkpoint_stays(folder):
+    diverged, large = teacher(), teacher()
+    with torch.no_grad():
+        diverged.network.unet.head[1].weight[0, 0] = torch.nan
+        large.network.unet.head[1].weight[0, 0] = 1e6
+    for policy, dtype, error, message in (
+        (diverged, "float32", CheckpointError, "diverged"),
+        (large, "float16", CheckpointError, "overflows"),
+        (OneStepTeacher(teacher()), "float32", CheckpointError, "wrapper"),
+        (teacher(), "float8", ConfigError, "float16"),
+    ):
+        with pytest.raises(error, match=message):
+            save_checkpoint(policy, folder, {}, dtype=dtype)
+    with pytest.raises(ConfigError, match="JSON"):
+        save_checkpoint(teacher(), folder, {"path": Path("x")})
+    assert torch.equal(act(load_checkpoint(folder)), act(teacher()))
+
+
+SAVER = """
+import sys
+sys.path.insert(0, sys.argv[2])
+from test_checkpoint import teacher, save_checkpoint
+from pathlib import Path
+policies = [teacher(seed=s) for s in (0, 1)]
+print("ready", flush=True)
+while True:
+    for policy in policies:
+        save_checkpoint(policy, Path(sys.argv[1]), {})
+"""
+
+
+def test_a_kill_while_saving_leaves_a_whole_checkpoint(folder):
+    """Killed at five moments of an endless loop of saves, one of the two policies is always there."""
+    wanted = [act(teacher(seed=s)) for s in (0, 1)]
+    for moment in range(5):
+        process = subprocess.Popen(
+            [sys.executable, "-c", SAVER, str(folder), str(Path(__file__).parent)], stdout=subprocess.PIPE
+        )
+        process.stdout.readline()
+        time.sleep(0.05 + 0.037 * moment)
+        process.send_signal(signal.SIGKILL)
+        process.wait()
+        process.stdout.close()
+        where = folder if folder.exists() else folder.with_name(folder.name + ".old")
+        assert any(torch.equal(act(load_checkpoint(where)), action) for action in wanted)
+        verify_checkpoint(where)

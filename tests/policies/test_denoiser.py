@@ -1,0 +1,88 @@
+import pytest
+import torch
+from policy_specs import CHUNK, TINY, make_obs, make_spec
+
+from manicm_ms.demos.stats import FieldStats
+from manicm_ms.errors import ConfigError
+from manicm_ms.policies.base import make_policy
+
+
+def stats(spec, seed=0):
+    g = torch.Generator().manual_seed(seed)
+
+    def of(channels):
+        low = torch.randn(channels, generator=g)
+        high = low + 0.5 + torch.rand(channels, generator=g)
+        return FieldStats(*(v.numpy() for v in (low, high, (low + high) / 2, (high - low) / 4)))
+
+    sizes = {"point_cloud": spec.obs.point_channels, "agent_pos": spec.obs.agent_pos_dim, "action": spec.action.dim}
+    return {name: of(channels) for name, channels in sizes.items()}
+
+
+def network(spec, **changes):
+    config = {"network": TINY["network"] | changes}
+    return make_policy("simple_dp3", spec, CHUNK, config, stats=stats(spec), seed=0).network
+
+
+def moved(obs, spec, by):
+    """Return the same scene with hand and cloud both moved by `by` (3,) metres."""
+    obs = {k: v.clone() for k, v in obs.items()}
+    obs["point_cloud"][..., :3] += by
+    obs["agent_pos"][..., list(spec.tcp_indices)] += by
+    return obs
+
+
+def cloud_features(net, obs):
+    return net.encoder.points(net.cloud_frame(obs["point_cloud"], obs["agent_pos"], net.normalizer).flatten(0, 1))
+
+
+def test_tcp_frame_subtracts_the_hand_of_the_same_frame_and_scales():
+    spec = make_spec()
+    obs, net = make_obs(spec, 2), network(spec, cloud_frame="tcp", cloud_scale=0.15)
+    seen = net.cloud_frame(obs["point_cloud"], obs["agent_pos"], net.normalizer)
+    for b in range(2):
+        for t in range(2):
+            tcp = obs["agent_pos"][b, t][[2, 0, 1]]  # where make_spec puts x, y, z
+            torch.testing.assert_close(seen[b, t], (obs["point_cloud"][b, t] - tcp) / 0.15)
+
+
+@pytest.mark.parametrize("channels", [3, 6])
+def test_moving_hand_and_cloud_together_is_invisible_in_the_tcp_frame_only(channels):
+    spec = make_spec(point_channels=channels)
+    obs, by = make_obs(spec, 2), torch.tensor([0.3, -0.2, 0.1])
+    for frame, same in (("tcp", True), ("base", False)):
+        net = network(spec, cloud_frame=frame)
+        a, b = cloud_features(net, obs), cloud_features(net, moved(obs, spec, by))
+        assert torch.allclose(a, b, atol=1e-4) is same
+
+
+def test_colours_are_normalised_in_the_tcp_frame():
+    spec = make_spec(point_channels=6)
+    obs, net = make_obs(spec, 2), network(spec, cloud_frame="tcp")
+    seen = net.cloud_frame(obs["point_cloud"], obs["agent_pos"], net.normalizer)
+    torch.testing.assert_close(seen[..., 3:], net.normalizer.normalize("point_cloud", obs["point_cloud"])[..., 3:])
+
+
+def test_tcp_frame_without_a_known_tcp_is_refused_with_the_remedy():
+    with pytest.raises(ConfigError, match="use cloud_frame 'base'"):
+        network(make_spec(tcp=False), cloud_frame="tcp")
+
+
+def test_only_the_first_points_are_read_where_max_points_says_so():
+    spec = make_spec(points=32)
+    obs, net = make_obs(spec, 2), network(spec, max_points=8)
+    prefix = {**obs, "point_cloud": obs["point_cloud"][:, :, :8]}
+    torch.testing.assert_close(net.encode(obs), net.encode(prefix), rtol=0, atol=0)
+    assert not torch.allclose(net.encode(obs), network(spec).encode(obs))
+
+
+def test_both_frames_of_the_history_and_both_inputs_matter():
+    spec = make_spec()
+    obs, net = make_obs(spec, 2), network(spec)
+    base = net.encode(obs)
+    assert base.shape == (2, net.cond_dim)
+    for key in ("point_cloud", "agent_pos"):
+        for frame in range(2):
+            other = {k: v.clone() for k, v in obs.items()}
+            other[key][:, frame] += 0.5
+            assert (net.encode(other) - base).abs().amax(1).min() > 1e-3
