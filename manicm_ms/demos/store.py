@@ -296,12 +296,15 @@ class DemoStore:
                 "whole: free some space and run the same command again"
             ) from e
 
-    def note_attempts(self, attempts: int) -> None:
-        """Write down how many episodes were tried so far, kept or not."""
+    def note(self, attempts: int | None = None, **provenance: Any) -> None:
+        """Write down how many episodes were tried so far, kept or not, and change entries of `provenance`."""
         self._require_writer()
-        if attempts != self.attempts:
-            self._attrs["attempts"] = int(attempts)
-            write_json(self.path / ".zattrs", self._attrs)
+        changed = {**self._attrs, "provenance": {**self._attrs["provenance"], **provenance}}
+        if attempts is not None:
+            changed["attempts"] = int(attempts)
+        if changed != self._attrs:
+            write_json(self.path / ".zattrs", changed)
+            self._attrs = changed
 
     def _require_writer(self) -> None:
         if self.mode != "a" or self._lock is None:
@@ -348,14 +351,13 @@ class DemoStore:
     def _commit(self, end: int) -> None:
         """Make the episode that ends at frame `end` exist."""
         folder, number = self.path / "meta" / "episode_ends", len(self)
-        chunk_file = folder / str(number // _CHUNK_EPISODES)
-        chunk = np.zeros(_CHUNK_EPISODES, "<i8")
-        if number % _CHUNK_EPISODES:
-            chunk[:] = np.frombuffer(chunk_file.read_bytes(), "<i8")
-        chunk[number % _CHUNK_EPISODES :] = 0
-        chunk[number % _CHUNK_EPISODES] = end
-        _write_bytes(chunk_file, chunk.tobytes())
         header = json.loads((folder / ".zarray").read_text())
+        rows = header["chunks"][0]
+        chunk_file, place = folder / str(number // rows), number % rows
+        chunk = np.frombuffer(chunk_file.read_bytes(), "<i8").copy() if place else np.zeros(rows, "<i8")
+        chunk[place:] = 0
+        chunk[place] = end
+        _write_bytes(chunk_file, chunk.tobytes())
         header["shape"] = [number + 1]
         write_json(folder / ".zarray", header)
         _sync(folder)

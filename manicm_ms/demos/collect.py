@@ -1,0 +1,370 @@
+"""Collecting: an expert plays seeds in parallel and the episodes it solves are kept, in the order of their seeds.
+
+What is kept depends on the environment, the expert and the first seed alone: seeds are tried in
+order, an episode is kept where its own seed was solved, and episodes are committed in the order of
+their seeds, so neither the number of environments nor an interruption changes the data.
+"""
+
+from __future__ import annotations
+
+import shlex
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from contextlib import ExitStack, contextmanager
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+import torch
+from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
+
+from manicm_ms.demos.experts import EXPERTS, Expert, ExpertFactory
+from manicm_ms.demos.store import OPTIONAL_FIELDS, DemoStore, Episode, frame_shapes
+from manicm_ms.envs.vec_env import make_vec
+from manicm_ms.errors import ConfigError, ManicmError, StoreError
+from manicm_ms.paths import require_free_space
+from manicm_ms.provenance import package_versions
+from manicm_ms.types import ACTION, AGENT_POS, DEPTH, IMAGE, POINT_CLOUD, STATE, EnvSpec
+
+_OBS_OF_FIELD = {
+    "point_cloud": POINT_CLOUD,
+    "agent_pos": AGENT_POS,
+    "image": IMAGE,
+    "depth": DEPTH,
+    "privileged_state": STATE,
+}
+# Beyond these failures an expert is broken, not unlucky.
+_FAILURES_PER_EPISODE, _FAILURES_FREE = 10, 50
+_IDENTITY = ("env_id", "seed", "expert", "style", "tail_steps", "fields", "point_channels", "backend")
+
+
+@dataclass(frozen=True)
+class Attempt:
+    """One seed that was played to its end.
+
+    Attributes:
+        seed: seed of the environment's reset.
+        episode: the demonstration, or None where the task was not solved.
+        reason: why there is none, in a few words; empty where there is one.
+    """
+
+    seed: int
+    episode: Episode | None
+    reason: str = ""
+
+
+@dataclass
+class _Row:
+    """What one row of the environment is playing."""
+
+    seed: int
+    frames: dict[str, list[np.ndarray]] = field(default_factory=dict)
+    solved_at: int | None = None  # steps played when success was first reported
+
+
+class Collector:
+    """Plays seed after seed with an expert on all rows of a vector environment.
+
+    Args:
+        env: vector environment whose observations hold `point_cloud`, `agent_pos`, `state` and
+            what `extras` needs; finished rows stay as they are until they are reset.
+        expert: plays all rows from `state`.
+        tail_steps: control steps kept after the first success where the task goes on after it.
+        extras: optional fields of `Episode` to record, from `OPTIONAL_FIELDS`.
+    """
+
+    def __init__(
+        self, env: gym.vector.VectorEnv, expert: Expert, *, tail_steps: int = 8, extras: Iterable[str] = ()
+    ) -> None:
+        if tail_steps < 0:
+            raise ConfigError(f"tail_steps must not be negative, got {tail_steps}")
+        self.env, self.expert, self.tail_steps = env, expert, tail_steps
+        self.spec: EnvSpec = env.env_spec  # type: ignore[attr-defined]
+        self.fields = ("point_cloud", "agent_pos", *extras)
+        self._obs: Mapping[str, Any] = {}
+        self._rows: list[_Row | None] = [None] * env.num_envs
+        self._seeds = [0] * env.num_envs
+        self._next_seed = 0
+
+    def attempts(self, first_seed: int, wanted: int) -> Iterator[Attempt]:
+        """Yield the attempts at first_seed, first_seed + 1, ... in this order, until `wanted` are solved."""
+        done: dict[int, Attempt] = {}
+        self._next_seed, turn = first_seed, first_seed
+        self._start(np.ones(self.env.num_envs, bool))
+        while wanted > 0:
+            for attempt in self._step():
+                done[attempt.seed] = attempt
+            while wanted > 0 and turn in done:
+                attempt = done.pop(turn)
+                turn += 1
+                wanted -= attempt.episode is not None
+                yield attempt
+            hopes = sum(a.episode is not None for a in done.values()) + sum(r is not None for r in self._rows)
+            self._start(self._idle_rows(wanted - hopes))
+
+    def _idle_rows(self, count: int) -> np.ndarray:
+        """Return a mask (N,) of the first `count` rows that play nothing.
+
+        A row is left idle where those at work suffice if they succeed: it would only slow them.
+        """
+        mask = np.zeros(len(self._rows), bool)
+        idle = [i for i, row in enumerate(self._rows) if row is None]
+        mask[idle[: max(count, 0)]] = True
+        return mask
+
+    def _start(self, mask: np.ndarray) -> None:
+        """Begin the next seeds in the rows of `mask` (N,) bool."""
+        if not mask.any():
+            return
+        for i in np.flatnonzero(mask):
+            self._seeds[i] = self._next_seed
+            self._rows[i] = _Row(self._next_seed)
+            self._next_seed += 1
+        self._obs, _ = self.env.reset(seed=list(self._seeds), options={"reset_mask": mask})
+        state = self._obs[STATE]
+        self.expert.reset(state, list(self._seeds), torch.as_tensor(mask, device=state.device))
+
+    def _step(self) -> list[Attempt]:
+        """Play one control step in all rows; return the attempts that ended with it."""
+        actions = self.expert.act(self._obs[STATE]).clamp(-1.0, 1.0)
+        self._record(actions)
+        self._obs, _, terminated, truncated, info = self.env.step(actions)
+        over, success = _numpy(terminated) | _numpy(truncated), _numpy(info["success"])
+        errors = info.get("error", [None] * len(self._rows))
+        ended = []
+        for i, row in enumerate(self._rows):
+            if row is None:
+                continue
+            steps = len(row.frames[ACTION])
+            if success[i] and row.solved_at is None:
+                row.solved_at = steps
+            tail_played = row.solved_at is not None and steps - row.solved_at >= self.tail_steps
+            if over[i] or tail_played or errors[i] or steps >= self.spec.max_episode_steps:
+                ended.append(self._finish(row, bool(success[i]), errors[i]))
+                self._rows[i] = None
+        return ended
+
+    def _record(self, actions: torch.Tensor) -> None:
+        """Keep what each playing row sees and does."""
+        frame = {name: _numpy(self._obs[_OBS_OF_FIELD[name]]) for name in self.fields}
+        frame[ACTION] = _numpy(actions)
+        for i, row in enumerate(self._rows):
+            if row is not None:
+                for name, values in frame.items():
+                    # A copy: the environment may write its next observation into the same memory.
+                    row.frames.setdefault(name, []).append(values[i].copy())
+
+    def _finish(self, row: _Row, success_now: bool, error: str | None) -> Attempt:
+        solved = success_now if self.spec.success_rule == "last" else row.solved_at is not None
+        if error:
+            return Attempt(row.seed, None, f"the episode crashed: {error}")
+        if not solved:
+            return Attempt(row.seed, None, f"not solved in {len(row.frames[ACTION])} steps")
+        arrays = {name: np.stack(values) for name, values in row.frames.items()}
+        if bad := [name for name, a in arrays.items() if a.dtype.kind == "f" and not np.isfinite(a).all()]:
+            return Attempt(row.seed, None, f"NaN or infinity in {', '.join(bad)}")
+        return Attempt(row.seed, Episode(**arrays, seed=row.seed, success=True))
+
+
+@dataclass(frozen=True)
+class Collected:
+    """What a collection came to.
+
+    Attributes:
+        path: the store.
+        episodes: episodes in it.
+        attempts: seeds tried for them, those of earlier runs of the same command included.
+        added: episodes that this run added.
+    """
+
+    path: Path
+    episodes: int
+    attempts: int
+    added: int
+
+
+def collect(
+    env_id: str,
+    episodes: int,
+    out: Path,
+    *,
+    num_envs: int = 1,
+    seed: int = 0,
+    style: str | None = None,
+    backend: str = "auto",
+    colors: bool = False,
+    extras: Iterable[str] = (),
+    tail_steps: int = 8,
+) -> Collected:
+    """Collect demonstrations of the registered expert of `env_id` into a store, with a progress bar.
+
+    A store that this call began earlier, and did not finish, is continued; one with enough episodes
+    is left as it is; one with fewer is extended.
+
+    Args:
+        env_id: for example "ur3e/slide-block".
+        episodes: solved episodes that the store is to hold.
+        out: the store, made if need be.
+        num_envs: environments that play at once; the data does not depend on it.
+        seed: seeds tried are seed, seed + 1, ...
+        style: the expert's style, its default one if None.
+        backend: "cpu", "gpu" or "auto", as in `make_vec`.
+        colors: store rgb beside xyz.
+        extras: optional fields of `Episode` to store, from `OPTIONAL_FIELDS`.
+        tail_steps: control steps kept after the first success where the task goes on after it.
+
+    Raises StoreError where `out` holds other data or has a writer already, NoSpaceError,
+    UnknownNameError for the id or the style, ManicmError where the expert fails far too often.
+    """
+    out, extras = Path(out), tuple(extras)
+    if episodes < 1 or num_envs < 1:
+        raise ConfigError(f"episodes and num_envs must be at least 1, got {episodes} and {num_envs}")
+    if unknown := set(extras) - set(OPTIONAL_FIELDS):
+        raise ConfigError(f"extras {sorted(unknown)} are not known: choose from {', '.join(OPTIONAL_FIELDS)}")
+    factory = EXPERTS.get(env_id)
+    asked = {
+        "env_id": env_id,
+        "seed": seed,
+        "tail_steps": tail_steps,
+        "fields": ["point_cloud", "agent_pos", ACTION, *(f for f in OPTIONAL_FIELDS if f in extras)],
+        "point_channels": 6 if colors else 3,
+    }
+    exists = out.exists() and not (out.is_dir() and not any(out.iterdir()))
+    if exists and (finished := _finished(out, episodes, asked, factory, style, backend)):
+        return finished
+    with ExitStack() as stack:
+        # The lock is taken before the environment is made, so that a second writer is refused at once.
+        store = stack.enter_context(DemoStore.open(out, "a")) if exists else None
+        obs = dict.fromkeys([POINT_CLOUD, AGENT_POS, STATE, *(_OBS_OF_FIELD[f] for f in extras)])
+        env = make_vec(env_id, num_envs=num_envs, backend=backend, obs=tuple(obs), colors=colors)
+        stack.callback(env.close)
+        expert = factory(env.env_spec, num_envs, env.device, style)
+        asked |= {"expert": expert.name, "style": expert.style, "backend": env.backend}
+        command = _command(asked, episodes, extras, colors)
+        if store is None:
+            provenance = asked | {"command": command, "versions": package_versions()}
+            store = stack.enter_context(_create(out, env.env_spec, provenance, episodes))
+        _require_same_origin(store, asked, env.env_spec)
+        with _progress_bar(env_id, episodes, len(store)) as report:
+            added = fill(store, Collector(env, expert, tail_steps=tail_steps, extras=extras), episodes, seed, report)
+        store.note(command=command)
+        return Collected(out, len(store), store.attempts, added)
+
+
+def fill(
+    store: DemoStore,
+    collector: Collector,
+    episodes: int,
+    first_seed: int,
+    report: Callable[[int, int], None] = lambda kept, attempts: None,
+) -> int:
+    """Append solved episodes to `store` until it holds `episodes`; return how many were added.
+
+    Args:
+        store: open for appending; what it holds must come from the same seeds and expert.
+        collector: plays the seeds that are still to be tried.
+        episodes: number of episodes that the store is to hold.
+        first_seed: seed of the very first attempt.
+        report: called with (episodes kept, attempts) after each attempt.
+
+    Raises ManicmError where far more attempts fail than a working expert's would.
+    """
+    kept = before = len(store)
+    tried = attempts_so_far(store, first_seed)
+    if kept >= episodes:
+        return 0
+    most = _FAILURES_PER_EPISODE * episodes + _FAILURES_FREE
+    for attempt in collector.attempts(first_seed + tried, episodes - kept):
+        tried += 1
+        if attempt.episode is not None:
+            store.append(attempt.episode)
+            kept += 1
+        # After the commit, so that a kill between the two can only make this number too small.
+        store.note(attempts=tried)
+        report(kept, tried)
+        if tried - kept > most:
+            raise ManicmError(
+                f"{tried - kept} of {tried} attempts failed (seed {attempt.seed}: {attempt.reason}): gave up; the "
+                f"{kept} solved episodes are kept in {store.path}. Try another style or mend the expert of the task"
+            )
+    return kept - before
+
+
+def attempts_so_far(store: DemoStore, first_seed: int) -> int:
+    """Return how many seeds from `first_seed` on need not be tried again.
+
+    The number noted in the store may lag behind its last episode by one, after a kill.
+    """
+    seeds = store.seeds
+    last = int(seeds[-1]) - first_seed + 1 if len(seeds) else 0
+    return max(store.attempts, last)
+
+
+def _finished(
+    out: Path, episodes: int, asked: Mapping[str, Any], factory: ExpertFactory, style: str | None, backend: str
+) -> Collected | None:
+    """Return what `out` holds where that is all that is asked for, without starting an environment.
+
+    Raises StoreError where it is no store, or holds other data than is asked for.
+    """
+    with DemoStore.open(out) as store:
+        if store.provenance.get("env_id") == asked["env_id"]:  # else the expert would not fit the specs
+            expert = factory(store.spec, 1, torch.device("cpu"), style)
+            asked = {**asked, "expert": expert.name, "style": expert.style}
+        if backend != "auto":
+            asked = {**asked, "backend": backend}
+        _require_same_origin(store, asked)
+        if len(store) < episodes:
+            return None
+        return Collected(out, len(store), attempts_so_far(store, int(asked["seed"])), 0)
+
+
+def _create(out: Path, spec: EnvSpec, provenance: Mapping[str, Any], episodes: int) -> DemoStore:
+    shapes = frame_shapes(spec)
+    frame_bytes = sum(int(np.prod(shapes[f][0])) * shapes[f][1].itemsize for f in provenance["fields"])
+    # A solved episode takes about half the steps that it may take.
+    require_free_space(out, frame_bytes * episodes * spec.max_episode_steps // 2)
+    extras = [f for f in provenance["fields"] if f in OPTIONAL_FIELDS]
+    return DemoStore.create(out, spec, provenance, extras=extras)
+
+
+def _require_same_origin(store: DemoStore, asked: Mapping[str, Any], spec: EnvSpec | None = None) -> None:
+    """Raise StoreError where the store's data came about otherwise than is asked for now."""
+    has = store.provenance
+    for key in _IDENTITY:
+        if key in asked and has.get(key) != asked[key]:
+            raise StoreError(
+                f"{store.path} holds demonstrations with {key} {has.get(key)!r} where {asked[key]!r} is asked for: "
+                "choose another --out, or the same options as before to go on"
+            )
+    if spec is not None and store.spec != spec:
+        raise StoreError(
+            f"{store.path} was collected with other specs of {spec.env_id} than it has now: choose another --out"
+        )
+
+
+def _command(asked: Mapping[str, Any], episodes: int, extras: tuple[str, ...], colors: bool) -> str:
+    """Return the command that makes the same data (the number of environments has no part in it)."""
+    words = ["manicm-ms", "collect", asked["env_id"], "--episodes", episodes, "--seed", asked["seed"]]
+    words += ["--style", asked["style"], "--backend", asked["backend"], "--tail-steps", asked["tail_steps"]]
+    words += ["--colors"] if colors else []
+    words += ["--extras", *extras] if extras else []
+    return shlex.join(str(w) for w in words)
+
+
+@contextmanager
+def _progress_bar(env_id: str, episodes: int, kept: int) -> Iterator[Callable[[int, int], None]]:
+    """Show the episodes kept and how many were tried for them; yield what reports both numbers."""
+    columns = (TextColumn("[bold]{task.description}"), BarColumn(), TextColumn("{task.fields[note]}"))
+    with Progress(*columns, TimeElapsedColumn(), TimeRemainingColumn()) as progress:
+        bar = progress.add_task(f"collect {env_id}", total=episodes, completed=kept, note=f"{kept} of {episodes} kept")
+
+        def report(kept: int, attempts: int) -> None:
+            progress.update(bar, completed=kept, note=f"{kept} of {episodes} kept, {attempts} tried")
+
+        yield report
+
+
+def _numpy(value: Any) -> np.ndarray:
+    return value.detach().cpu().numpy() if isinstance(value, torch.Tensor) else np.asarray(value)
