@@ -79,6 +79,7 @@ def make_env(**kwargs: Any) -> GripperHoldEnv:
     """Build the environment without a renderer and reset it; `kwargs` go to it (cube_size, control_mode, ...)."""
     settings = {"obs_mode": "none", "reward_mode": "none", "sim_backend": "physx_cpu", "render_backend": "none"}
     env = gymnasium.make("GripperHold-v0", **(settings | kwargs)).unwrapped
+    assert isinstance(env, GripperHoldEnv)
     env.reset(seed=0)
     return env
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import cast
 
 import numpy as np
 import trimesh
@@ -230,7 +231,7 @@ def _finger() -> list[Part]:
 
 def _merge(parts: Sequence[Part], color: Color) -> trimesh.Trimesh:
     shaded = [trimesh.graph.smooth_shade(p.mesh, angle=math.radians(30)) for p in parts if p.color == color]
-    mesh = trimesh.util.concatenate(shaded)
+    mesh = cast(trimesh.Trimesh, trimesh.util.concatenate(shaded))
     vertices, normals, faces = mesh.vertices, mesh.vertex_normals, mesh.faces
     metal = 0.35 if color in (ALUMINIUM, GRIPPER_STEEL) else 0.0
     material = PBRMaterial(baseColorFactor=[*color, 255], metallicFactor=metal, roughnessFactor=0.55)

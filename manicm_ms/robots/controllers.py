@@ -41,6 +41,8 @@ class LimitedPoseController(PDEEPoseController):
     """
 
     config: LimitedPoseControllerConfig
+    _target_pose: Pose
+    _target_qpos: Tensor
 
     def _initialize_joints(self) -> None:
         super()._initialize_joints()
@@ -145,9 +147,10 @@ class OpeningController(PDJointPosController):
     """
 
     config: OpeningControllerConfig
+    _target_qpos: Tensor
 
     def _initialize_action_space(self) -> None:
-        low, high = np.float32([self.config.lower]), np.float32([self.config.upper])
+        low, high = (np.array([bound], dtype=np.float32) for bound in (self.config.lower, self.config.upper))
         self.single_action_space = spaces.Box(low, high, dtype=np.float32)
 
     def set_action(self, action: Tensor) -> None:

@@ -7,8 +7,10 @@ from typing import Any
 
 import numpy as np
 import pytest
+import sapien
 import torch
 from mani_skill.agents.controllers.utils.kinematics import Kinematics
+from mani_skill.trajectory.utils.actions.conversion import delta_pose_to_pd_ee_delta
 from mani_skill.utils.geometry.rotation_conversions import matrix_to_quaternion
 from mani_skill.utils.structs import Pose
 
@@ -134,6 +136,23 @@ def test_rotation_is_clipped_by_its_norm(make_robot_env: Any) -> None:
     play(env, [0, 0, 0, 1, 1, 1, 1])
     turned = rotation_between(env.agent.tcp_target_pose, start)
     torch.testing.assert_close(turned, torch.full((3,), TCP_TURN / 3**0.5), atol=1e-5, rtol=0)
+
+
+def test_trajectory_converter_finds_the_action(make_robot_env: Any) -> None:
+    # ManiSkill's converter (replay_trajectory) hands over the inverse rotation; its result must still lead to the goal.
+    env = make_robot_env()
+    agent = env.agent
+    play(env, [0, 0, -1, 0, 0, 0, 1], 8)
+    now = agent.tcp_target_pose
+    turn = torch.tensor([[0.02, -0.03, 0.04]])
+    goal = torch.cat([now[:, :3] + 0.005, quat_multiply(quat_from_rotvec(turn), now[:, 3:])], dim=1)
+    inverse = Pose.create(now).sp * Pose.create(goal).sp.inv()
+    delta = sapien.Pose((goal - now)[0, :3].numpy(), inverse.q)
+    action = delta_pose_to_pd_ee_delta(agent.controller.controllers["arm"], delta)
+    play(env, [*action.tolist(), 1.0])
+    reached = agent.tcp_target_pose
+    torch.testing.assert_close(reached[:, :3], goal[:, :3], atol=1e-5, rtol=0)
+    assert rotation_between(reached, goal).norm() < 1e-4
 
 
 def test_absolute_pose_is_reached(make_robot_env: Any) -> None:
