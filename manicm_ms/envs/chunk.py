@@ -62,7 +62,7 @@ class ActionChunk:
         for name, values in self._info.items():
             self._info[name] = values.index_fill(0, rows, 0)
         self._restart_history(self.simulator.observe(), rows)
-        return self._history, self.info()
+        return dict(self._history), self.info()
 
     def step(self, actions: Tensor) -> tuple[dict[str, Tensor], Tensor, dict[str, Tensor]]:
         """Play actions (n, Ta, Da); return histories (n, To, ...), summed rewards (n,) and info (n,)."""
@@ -83,7 +83,7 @@ class ActionChunk:
                 break
             reward += torch.where(active, result.reward, 0.0)
             active = active & ~ended
-        return self._history, reward, self.info()
+        return dict(self._history), reward, self.info()
 
     def info(self) -> dict[str, Tensor]:
         """Return per-row facts (n,): those of the task and success_once, elapsed_steps, clipped."""
