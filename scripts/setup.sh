@@ -67,7 +67,7 @@ venv_works() {
 pip_install() {
     $VENV/bin/python -m pip install --no-input --disable-pip-version-check --progress-bar off -c constraints.txt "$@" \
         2> >(grep -v '^WARNING: Location' >&2) |
-        { grep --line-buffered -E '^ *(Downloading .* MB|Installing|Successfully)' | cut -c 1-120 || true; }
+        { grep --line-buffered -E '^ *(Downloading .* MB|Installing collected)' || true; }
 }
 
 install_packages() {
@@ -79,8 +79,8 @@ install_packages() {
             pip_install --no-build-isolation -e '.[dev]' &&
             install_mani_skill && prefer_headless_opencv
     } || status=$?
-    # A failure that pip reported left whole packages; a kill does not come here and leaves the mark.
-    rm -f $INSTALLING
+    # A failure that pip reports itself leaves whole packages; a kill or Ctrl-C may not, so then the mark stays.
+    [ $status -ge 128 ] || rm -f $INSTALLING
     [ $status = 0 ] || fail "pip failed (see above): put right what it names (network, disk, index) and run it again"
 }
 
@@ -112,6 +112,7 @@ if command -v flock >/dev/null && [ -z "${MANICM_MS_SETUP_LOCKED:-}" ]; then
     MANICM_MS_SETUP_LOCKED=1 exec flock .setup-lock "$0" "$@" # one set-up at a time; a kill frees the lock
 fi
 if up_to_date; then exit 0; fi
+trap 'exit 130' INT TERM
 rm -f $STAMP
 if ! venv_works; then make_venv; fi
 install_packages

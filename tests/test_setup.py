@@ -1,0 +1,211 @@
+"""The set-up scripts: apt's configuration in both formats, and a stamp that knows when to start anew."""
+
+import importlib.util
+import os
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+REPO = Path(__file__).resolve().parents[1]
+
+
+@pytest.fixture(scope="module")
+def setup_vulkan():
+    spec = importlib.util.spec_from_file_location("setup_vulkan", REPO / "scripts" / "setup_vulkan.py")
+    module = importlib.util.module_from_spec(spec)
+    sys.modules["setup_vulkan"] = module  # dataclasses look their module up
+    spec.loader.exec_module(module)
+    yield module
+    del sys.modules["setup_vulkan"]
+
+
+DEB822 = """\
+Types: deb
+# a comment
+URIs: http://mirror.example/debian
+Suites: bookworm bookworm-updates
+Components: main
+Signed-By: /usr/share/keyrings/ring.gpg
+
+Types: deb-src
+URIs: http://mirror.example/debian
+Suites: bookworm
+Components: main
+
+Enabled: no
+Types: deb
+URIs: http://off.example/
+Suites: bookworm
+Components: main
+"""
+EMBEDDED_KEY = """\
+Types: deb
+URIs: http://mirror.example/debian
+Suites: bookworm
+Components: main
+Signed-By:
+ -----BEGIN PGP PUBLIC KEY BLOCK-----
+ .
+ abc
+ -----END PGP PUBLIC KEY BLOCK-----
+"""
+ONE_LINE = """\
+# deb http://off.example/ bookworm main
+deb [arch=amd64 signed-by=/ring.gpg] https://third.example/ cloud-bookworm main
+deb [arch=amd64,arm64 signed-by=/usr/share/keyrings/ring.gpg] http://mirror.example/debian bookworm main contrib # here
+deb-src http://mirror.example/debian bookworm main
+"""
+
+
+def backports(module, root):
+    return module.backports_of(module.apt_sources(root), "bookworm")
+
+
+def test_backports_take_mirror_and_key_from_deb822(setup_vulkan, tmp_path):
+    (tmp_path / "sources.list.d").mkdir()
+    (tmp_path / "sources.list.d" / "debian.sources").write_text(DEB822)
+    assert backports(setup_vulkan, tmp_path).deb822() == (
+        "Types: deb\nURIs: http://mirror.example/debian\nSuites: bookworm-backports\nComponents: main\n"
+        "Signed-By: /usr/share/keyrings/ring.gpg\n"
+    )
+
+
+def test_backports_take_mirror_and_key_from_one_line_format(setup_vulkan, tmp_path):
+    (tmp_path / "sources.list").write_text(ONE_LINE)
+    assert backports(setup_vulkan, tmp_path).deb822() == (
+        "Types: deb\nURIs: http://mirror.example/debian\nSuites: bookworm-backports\nComponents: main\n"
+        "Architectures: amd64 arm64\nSigned-By: /usr/share/keyrings/ring.gpg\n"
+    )
+
+
+def test_an_embedded_key_survives(setup_vulkan):
+    (source,) = setup_vulkan.parse_deb822(EMBEDDED_KEY)
+    assert setup_vulkan.parse_deb822(source.deb822()) == [source]
+    assert "\n .\n abc\n" in source.deb822()
+
+
+def test_a_machine_without_a_main_mirror_has_no_backports(setup_vulkan, tmp_path):
+    (tmp_path / "sources.list").write_text("deb https://third.example/ cloud-bookworm main\n")
+    assert backports(setup_vulkan, tmp_path) is None
+
+
+@pytest.mark.parametrize(
+    ("version", "enough"),
+    [("22.3.6-1+deb12u2", False), ("24.2.8-1ubuntu1~24.04.1", False), ("24.3.0-1", True), ("25.0.7-2~bpo12+1", True)],
+)
+def test_lavapipe_must_be_24_3(setup_vulkan, version, enough):
+    assert (setup_vulkan.mesa_version(version) >= setup_vulkan.NEEDED_MESA) is enough
+
+
+# ------------------------------------------------ setup.sh with a Python that only notes what it is asked
+
+
+@pytest.fixture
+def checkout(tmp_path) -> Path:
+    """A copy of what set-up reads, with a stand-in for Python: set-up's own decisions are what is looked at here."""
+    copy = tmp_path / "repo"
+    (copy / "scripts").mkdir(parents=True)
+    for name in ("setup.cfg", "pyproject.toml", "constraints.txt", "scripts/setup.sh", "scripts/setup_vulkan.py"):
+        shutil.copy(REPO / name, copy / name)
+    stand_in = copy / "standin"
+    stand_in.write_text(
+        """#!/bin/bash
+echo "$*" >> calls
+case "$*" in
+    *"-m venv"*) mkdir -p .venv/bin; cp "$0" .venv/bin/python;;
+    *get_path*) mkdir -p .venv/cv2; echo 'headless = True' > .venv/cv2/version.py; echo .venv/cv2/version.py;;
+    *"version_info[:2] >= (3, 13)"*) exit 0;;
+    *"install "*-e*) [ ! -e pip-fails ] || exit 1; [ ! -e pip-is-killed ] || kill -9 $PPID
+        [ ! -e pip-kills-itself ] || kill -9 $$;;
+    *setup_vulkan*) [ ! -e vulkan-fails ] || exit 1;;
+esac
+"""
+    )
+    stand_in.chmod(0o755)
+    return copy
+
+
+def run_setup(checkout: Path, **env: str) -> tuple[int, str]:
+    """Run setup.sh; return its exit status and what it asked of Python."""
+    (checkout / "calls").unlink(missing_ok=True)
+    environment = {**os.environ, "PYTHON": str(checkout / "standin"), **env}
+    done = subprocess.run(["bash", "scripts/setup.sh"], cwd=checkout, env=environment, capture_output=True, check=False)
+    calls = checkout / "calls"
+    return done.returncode, calls.read_text() if calls.exists() else ""
+
+
+def test_a_second_run_asks_nothing_of_python(checkout):
+    status, calls = run_setup(checkout)
+    assert status == 0
+    assert "-m venv" in calls
+    assert "setup_vulkan.py" in calls
+    assert run_setup(checkout) == (0, "")
+    assert "install" in run_setup(checkout, FORCE="1")[1]
+
+
+@pytest.mark.parametrize("name", ["constraints.txt", "setup.cfg", "scripts/setup_vulkan.py"])
+def test_a_changed_input_is_noticed(checkout, name):
+    run_setup(checkout)
+    with (checkout / name).open("a") as f:
+        f.write("\n# changed\n")
+    status, calls = run_setup(checkout)
+    assert status == 0
+    assert "-e .[dev]" in calls
+    assert "-m venv" not in calls  # the environment stays
+    assert run_setup(checkout) == (0, "")
+
+
+def test_a_moved_checkout_is_noticed(checkout):
+    run_setup(checkout)
+    moved = checkout.rename(checkout.with_name("elsewhere"))
+    status, calls = run_setup(moved)
+    assert status == 0
+    assert "-e .[dev]" in calls  # the editable installation pointed at the old place
+    assert run_setup(moved) == (0, "")
+
+
+def test_a_pip_failure_is_told_and_repaired_in_place(checkout):
+    (checkout / "pip-fails").touch()
+    status, _ = run_setup(checkout)
+    assert status != 0
+    assert not (checkout / ".venv/.setup-done").exists()
+    (checkout / "pip-fails").unlink()
+    status, calls = run_setup(checkout)
+    assert status == 0
+    assert "-m venv" not in calls
+
+
+def test_a_kill_during_the_installation_starts_the_environment_anew(checkout):
+    (checkout / "pip-is-killed").touch()
+    assert run_setup(checkout)[0] != 0
+    (checkout / "pip-is-killed").unlink()
+    (checkout / ".venv" / "half-installed").touch()
+    status, calls = run_setup(checkout)
+    assert status == 0
+    assert "-m venv" in calls
+    assert not (checkout / ".venv" / "half-installed").exists()
+
+
+def test_a_killed_pip_starts_the_environment_anew(checkout):
+    (checkout / "pip-kills-itself").touch()
+    assert run_setup(checkout)[0] != 0
+    (checkout / "pip-kills-itself").unlink()
+    assert "-m venv" in run_setup(checkout)[1]
+
+
+def test_a_rendering_failure_is_tried_again(checkout):
+    (checkout / "vulkan-fails").touch()
+    assert run_setup(checkout)[0] != 0
+    (checkout / "vulkan-fails").unlink()
+    status, calls = run_setup(checkout)
+    assert status == 0
+    assert "setup_vulkan.py" in calls
+
+
+def test_an_unsuitable_python_is_refused(checkout, tmp_path):
+    (tmp_path / "old").write_text("#!/bin/sh\nexit 1\n")
+    (tmp_path / "old").chmod(0o755)
+    assert run_setup(checkout, PYTHON=str(tmp_path / "old")) == (1, "")
