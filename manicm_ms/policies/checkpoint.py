@@ -94,6 +94,11 @@ def read_manifest(folder: Path) -> dict[str, Any]:
     folder = Path(folder)
     path = folder / _MANIFEST
     if not folder.is_dir():
+        old = folder.with_name(folder.name + ".old")
+        if old.is_dir():
+            raise CheckpointError(
+                f"saving {folder} was cut off and left the checkpoint before it: rename {old} to {folder}"
+            )
         raise CheckpointError(f"there is no checkpoint folder {folder}: train one, or check the path")
     if not path.is_file():
         raise CheckpointError(f"{folder} is no checkpoint of this package: it has no {_MANIFEST}")
