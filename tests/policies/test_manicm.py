@@ -116,3 +116,13 @@ def test_is_rebuilt_from_its_configuration():
     obs = make_obs(policy.spec, 2)
     actions = [p.act(obs, generator=torch.Generator().manual_seed(0)) for p in (policy, again)]
     assert torch.equal(*actions)
+
+
+@pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a CUDA device")
+@pytest.mark.parametrize("nfe", [1, 4])
+def test_a_cpu_generator_gives_every_device_the_same_actions(nfe):
+    policy, obs = student(nfe), make_obs(make_spec(), 3)
+    expected = policy.act(obs, generator=torch.Generator().manual_seed(0))
+    policy.to("cuda")
+    got = policy.act({k: v.cuda() for k, v in obs.items()}, generator=torch.Generator().manual_seed(0))
+    torch.testing.assert_close(got.cpu(), expected, rtol=1e-3, atol=1e-3)
