@@ -27,23 +27,19 @@ def expert_action(hand, target):
     return np.clip((target - hand) / STEP, -1.0, 1.0)
 
 
-def cloud_at(hand, target, num_points, rng):
-    """(P, 3) metres: half of the points around the target, half around the hand, in random order."""
-    half = num_points // 2
-    points = np.concatenate(
-        [target + 0.01 * rng.normal(size=(num_points - half, 3)), hand + 0.01 * rng.normal(size=(half, 3))]
-    )
-    return rng.permutation(points).astype(np.float32)
+def cloud_at(target, num_points, rng):
+    """(P, 3) metres: points around the target, in random order."""
+    return (target + 0.01 * rng.normal(size=(num_points, 3))).astype(np.float32)
 
 
 def reach_episode(seed, spec, length=12):
     rng = np.random.default_rng(seed)
     target = rng.uniform([0.3, -0.2, 0.0], [0.6, 0.2, 0.1])
-    hand = rng.uniform([0.2, -0.3, 0.2], [0.7, 0.3, 0.4])
+    hand = target + rng.uniform(-0.3, 0.3, 3)
     clouds, poses, actions = [], [], []
     for _ in range(length):
         action = expert_action(hand, target)
-        clouds.append(cloud_at(hand, target, spec.obs.num_points, rng))
+        clouds.append(cloud_at(target, spec.obs.num_points, rng))
         poses.append([*hand, 0.04])
         actions.append(np.resize(action, spec.action.dim))
         hand = hand + STEP * action
