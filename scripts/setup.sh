@@ -67,7 +67,7 @@ venv_works() {
 pip_install() {
     $VENV/bin/python -m pip install --no-input --disable-pip-version-check --progress-bar off -c constraints.txt "$@" \
         2> >(grep -v '^WARNING: Location' >&2) |
-        { grep --line-buffered -E '^ *(Downloading .* MB|Installing collected)' || true; }
+        { grep --line-buffered -o -E '^ *(Downloading .* \(?[0-9.]+ MB.*|Installing collected packages)' || true; }
 }
 
 install_packages() {
