@@ -10,6 +10,8 @@ from torch import Tensor
 from manicm_ms.envs.simulator import Simulator, StepResult
 from manicm_ms.types import ChunkSpec
 
+_DIVERGED = "the simulation diverged: the observation holds NaN or infinity"
+
 
 class ActionChunk:
     """Plays action chunks in n rows and renders only the frames that a policy will read.
@@ -21,8 +23,9 @@ class ActionChunk:
         rendered            r    r
 
     A row that ends inside a chunk stops there: its last frame is rendered, its other actions are not played, and
-    it stays as it is until it is reset. A row whose simulator raises has crashed: it is terminated without
-    success, with the reason in `errors`.
+    it stays as it is until it is reset. A row whose observation is not finite has crashed: it is terminated without
+    success, with the reason in `errors`, and keeps its last finite history. Where the simulator raises, all rows that
+    were playing have crashed.
 
     Args:
         simulator: the n rows.
@@ -61,7 +64,10 @@ class ActionChunk:
             self.errors[row] = None
         for name, values in self._info.items():
             self._info[name] = values.index_fill(0, rows, 0)
-        self._restart_history(self.simulator.observe(), rows)
+        frame = self.simulator.observe()
+        self._restart_history(frame, rows)
+        fresh = torch.zeros_like(self.terminated).index_fill(0, rows, True)
+        self._crash(fresh & ~_finite(frame), _DIVERGED)
         return dict(self._history), self.info()
 
     def step(self, actions: Tensor) -> tuple[dict[str, Tensor], Tensor, dict[str, Tensor]]:
@@ -77,11 +83,11 @@ class ActionChunk:
                 result = self.simulator.step(action.clamp(-1, 1))
                 ended = self._account(result, active)
                 if k >= self.n_action_steps - self.n_obs_steps or ended.any():
-                    self._push(self.simulator.observe(), active)
+                    ended |= self._read(active)
             except Exception as error:  # whatever the simulator raises ends these episodes, not the run
-                self._crash(active, error)
+                self._crash(active, f"{type(error).__name__}: {error}")
                 break
-            reward += torch.where(active, result.reward, 0.0)
+            reward += torch.where(active & torch.isfinite(result.reward), result.reward, 0.0)
             active = active & ~ended
         return dict(self._history), reward, self.info()
 
@@ -102,12 +108,23 @@ class ActionChunk:
         self.success_once |= self._info["success"]
         return active & (self.terminated | self.truncated)
 
-    def _crash(self, active: Tensor, error: Exception) -> None:
-        self.terminated |= active
-        self._info["success"] = self._info.get("success", torch.zeros_like(active)) & ~active
-        self.success_once &= ~active
-        for row in active.nonzero().flatten().tolist():
-            self.errors[row] = f"{type(error).__name__}: {error}"
+    def _read(self, active: Tensor) -> Tensor:
+        """Observe, and append the frame to the histories of the active rows; return which crashed by it, (n,) bool."""
+        frame = self.simulator.observe()
+        crashed = active & ~_finite(frame)
+        self._push(frame, active & ~crashed)
+        self._crash(crashed, _DIVERGED)
+        return crashed
+
+    def _crash(self, crashed: Tensor, reason: str) -> None:
+        if not crashed.any():
+            return
+        self.terminated |= crashed
+        self.truncated &= ~crashed
+        self._info["success"] = self._info.get("success", torch.zeros_like(crashed)) & ~crashed
+        self.success_once &= ~crashed
+        for row in crashed.nonzero().flatten().tolist():
+            self.errors[row] = reason
 
     def _restart_history(self, frame: dict[str, Tensor], rows: Tensor) -> None:
         for key, values in frame.items():
@@ -123,3 +140,10 @@ class ActionChunk:
             old = self._history[key]
             new = torch.cat([old[:, 1:], values[:, None]], dim=1)
             self._history[key] = torch.where(active.view(-1, *[1] * values.dim()), new, old)
+
+
+def _finite(frame: dict[str, Tensor]) -> Tensor:
+    """Return which rows of a frame hold finite numbers only, (n,) bool."""
+    parts = [torch.isfinite(v).flatten(1).all(dim=1) for v in frame.values() if v.is_floating_point()]
+    n, device = next((len(v), v.device) for v in frame.values())
+    return torch.stack(parts).all(dim=0) if parts else torch.ones(n, dtype=torch.bool, device=device)

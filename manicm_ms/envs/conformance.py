@@ -48,7 +48,7 @@ class _Checks:
     def __init__(self, env_id: str, backend: str) -> None:
         self._env_id, self._backend = env_id, backend
         self.env = self._make(2, obs=_EVERY_KEY)
-        self._episode = self._play(self.env, _SEEDS)
+        self._episode: list[Obs] = []
 
     def _make(self, num_envs: int, **options: object) -> VecEnv:
         return make_vec(self._env_id, num_envs, self._backend, **options)  # type: ignore[arg-type]
@@ -65,6 +65,10 @@ class _Checks:
         return frames
 
     # ---- the properties ---------------------------------------------------------------------------------------
+
+    def plays(self) -> None:
+        """First: the others look at what it played."""
+        self._episode = self._play(self.env, _SEEDS)
 
     def spaces_hold(self) -> None:
         for frame in self._episode:
@@ -180,7 +184,7 @@ class _Checks:
             idle = torch.zeros(1, env.env_spec.action.dim, device=env.device)
             for _ in range(env.env_spec.max_episode_steps):
                 obs, _, terminated, truncated, info = env.step(idle)
-            _require(terminated.item() or truncated.item(), "the time limit did not end the episode")
+            _require(bool(terminated | truncated), "the time limit did not end the episode")
             elapsed = info["elapsed_steps"].item()
             again, reward, _, truncated_again, info = env.step(idle + 1)
         finally:
@@ -197,6 +201,7 @@ class _Checks:
 
 
 PROPERTIES: tuple[Callable[[_Checks], None], ...] = (
+    _Checks.plays,
     _Checks.spaces_hold,
     _Checks.observations_finite,
     _Checks.same_seed_same_episode,
@@ -220,10 +225,10 @@ def check_vec_env(
 ) -> list[Property]:
     """Check the promises of `VecEnv` on an environment id, by playing it.
 
-    Checked are: spaces and dtypes; finite observations; the same seed gives the same episode, again, alone and in
-    another process; seeds differ; observations answer to actions and share no memory; a partial reset leaves the other
-    rows as they are; NaN and misshapen actions are refused, those out of range clipped and counted; info is complete;
-    a chunk equals its single steps; the time limit truncates and freezes; closing twice is harmless.
+    Checked are: it plays at all; spaces and dtypes; finite observations; the same seed gives the same episode, again,
+    alone and in another process; seeds differ; observations answer to actions and share no memory; a partial reset
+    leaves the other rows as they are; NaN and misshapen actions are refused, those out of range clipped and counted;
+    info is complete; a chunk equals its single steps; the time limit truncates and freezes; closing twice is harmless.
 
     Args:
         env_id: a registered id.
@@ -231,7 +236,10 @@ def check_vec_env(
         on_result: called with each property as soon as it is known.
 
     Returns:
-        one `Property` a promise, in a fixed order.
+        one `Property` a promise, in a fixed order; only the first one where it does not play.
+
+    Raises:
+        UnknownNameError, BackendError, RenderDeviceError: see `make_vec`.
     """
     checks = _Checks(env_id, backend)
     results = []
@@ -239,6 +247,8 @@ def check_vec_env(
         for check in PROPERTIES:
             results.append(_run(check, checks))
             on_result(results[-1])
+            if check is _Checks.plays and not results[-1].passed:
+                break
     finally:
         checks.env.close()
     return results
@@ -250,6 +260,8 @@ def _run(check: Callable[[_Checks], None], checks: _Checks) -> Property:
         check(checks)
     except (ViolationError, ManicmError) as error:
         return Property(name, False, str(error))
+    except Exception as error:  # whatever an environment raises is its own failure, not this check's
+        return Property(name, False, f"{type(error).__name__}: {error}")
     return Property(name, True)
 
 

@@ -7,7 +7,8 @@ from manicm_ms.types import AGENT_POS, DEPTH, IMAGE, POINT_CLOUD, STATE, ActionS
 
 MAX_STEPS = 12
 CRASH_X = 3.0  # m: a row beyond it makes `step` raise
-DIVERGE_Y = 3.0  # m: a row beyond it makes `observe` raise
+RAISE_Y = -3.0  # m: a row below it makes `observe` raise
+DIVERGE_Y = 3.0  # m: a row beyond it is observed as NaN
 GOAL_X = 1.0  # m
 
 
@@ -48,14 +49,14 @@ class PointMass(Simulator):
 
     def observe(self):
         self.observed += 1
-        if (self.position[:, 1] > DIVERGE_Y).any():
-            raise FloatingPointError("diverged")
+        if (self.position[:, 1] < RAISE_Y).any():
+            raise ValueError("no picture")
         n, (height, width) = self.num_rows, self.spec.obs.image_size
         shape = (n, self.spec.obs.num_points, self.spec.obs.point_channels)
         depth = torch.arange(height * width).view(height, width) + self.position[:, :1, None]
         every = {
             POINT_CLOUD: self.position.repeat(1, shape[2])[:, None, : shape[2]].expand(shape).clone(),
-            AGENT_POS: self.position.clone(),
+            AGENT_POS: torch.where(self.position[:, 1:] > DIVERGE_Y, torch.nan, self.position),
             STATE: self.position.clone(),
             DEPTH: depth,
             IMAGE: (depth[..., None].expand(n, height, width, 3) * 2).to(torch.uint8),
@@ -84,15 +85,15 @@ class IgnoresActions(PointMass):
         return super().step(torch.zeros_like(actions))
 
 
-class WrongDtype(PointMass):
+class WrongShape(PointMass):
     def observe(self):
-        return {key: value.double() if key == DEPTH else value for key, value in super().observe().items()}
+        return {key: value[:, 1:] if key == DEPTH else value for key, value in super().observe().items()}
 
 
 class NotFinite(PointMass):
     def observe(self):
         frame = super().observe()
-        frame[DEPTH][:, 0, 0] = torch.inf
+        frame[AGENT_POS][:, 0] = torch.inf
         return frame
 
 
@@ -111,7 +112,7 @@ BROKEN = {
     "toy/ignores-seed": (IgnoresSeed, "other seed other start"),
     "toy/global-random": (DrawsFromGlobalState, "same seed same episode"),
     "toy/ignores-actions": (IgnoresActions, "observations vary"),
-    "toy/wrong-dtype": (WrongDtype, "spaces hold"),
+    "toy/wrong-shape": (WrongShape, "plays"),
     "toy/not-finite": (NotFinite, "observations finite"),
     "toy/remembers": (RemembersTheLastEpisode, "same seed same episode"),
 }

@@ -3,7 +3,7 @@
 import point_mass_env
 import pytest
 import torch
-from point_mass_env import CRASH_X, DIVERGE_Y, GOAL_X, MAX_STEPS
+from point_mass_env import CRASH_X, DIVERGE_Y, GOAL_X, MAX_STEPS, RAISE_Y
 
 from manicm_ms.envs.chunk import ActionChunk
 from manicm_ms.types import AGENT_POS, POINT_CLOUD, ChunkSpec
@@ -141,12 +141,19 @@ def test_out_of_range_entries_are_clipped_and_counted_until_the_row_ends():
     torch.testing.assert_close(rows.simulator.position[1], torch.tensor([-2.5 + 1 + 1 + 0.5, -1.0]))
 
 
-@pytest.mark.parametrize(("where", "reason"), [({"x": -9.0, "y": DIVERGE_Y}, "FloatingPointError: diverged"),
-                                              ({"x": CRASH_X}, "RuntimeError: left the world")])  # fmt: skip
-def test_crash_ends_the_episode_without_success_and_with_its_reason(where, reason):
+DIVERGED = "the simulation diverged: the observation holds NaN or infinity"
+CRASHES = [
+    ({"x": -9.0, "y": DIVERGE_Y}, 0.5, DIVERGED),
+    ({"x": -9.0, "y": RAISE_Y}, -0.5, "ValueError: no picture"),
+    ({"x": CRASH_X}, 0.0, "RuntimeError: left the world"),
+]
+
+
+@pytest.mark.parametrize(("where", "dy", "reason"), CRASHES)
+def test_crash_ends_the_episode_without_success_and_with_its_reason(where, dy, reason):
     rows, *_ = make(1)
     put(rows, 0, **where)
-    after, _, info = rows.step(actions(rows, *[(0.5, 0.5)] * 3))
+    after, _, info = rows.step(actions(rows, *[(0.5, dy)] * 3))
     assert rows.terminated.tolist() == [True]
     assert info["success"].tolist() == info["success_once"].tolist() == [False]
     assert rows.errors == [reason]
@@ -164,6 +171,26 @@ def test_crash_in_the_observation_of_a_success_does_not_count_as_success():
     put(rows, 0, x=GOAL_X, y=DIVERGE_Y)
     _, _, info = rows.step(actions(rows, *[(0.5, 0.5)] * 3))
     assert info["success_once"].tolist() == info["success"].tolist() == [False]
+
+
+def test_a_diverged_row_takes_no_other_with_it():
+    rows, *_ = make(3)
+    put(rows, 0, y=DIVERGE_Y + 1)
+    for _ in range(2):  # in the second chunk the frozen row is still NaN underneath
+        history, reward, info = rows.step(actions(rows, *[(0.01, 0.0)] * 3))
+    assert rows.errors == [DIVERGED, None, None]
+    assert rows.terminated.tolist() == [True, False, False]
+    assert info["elapsed_steps"].tolist()[1:] == [6, 6]
+    assert torch.isfinite(history[AGENT_POS]).all()
+    assert torch.isfinite(reward).all()
+
+
+def test_a_row_that_starts_diverged_is_ended_at_once():
+    rows, *_ = make(2)
+    rows.simulator.start = lambda seed: torch.tensor([0.0, DIVERGE_Y + 1])
+    rows.reset(torch.tensor([1]), [3])
+    assert rows.terminated.tolist() == [False, True]
+    assert rows.errors == [None, DIVERGED]
 
 
 def test_rows_that_had_succeeded_keep_their_success_when_another_crashes():

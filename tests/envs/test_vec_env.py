@@ -1,0 +1,272 @@
+"""The vector environments: their promises on every registered id, that a broken one is caught, and errors."""
+
+import os
+import signal
+import time
+from contextlib import closing
+
+import numpy as np
+import point_mass_env
+import pytest
+import torch
+from point_mass_env import BROKEN, SOUND
+
+from manicm_ms.envs.conformance import PROPERTIES, check_vec_env
+from manicm_ms.envs.simulator import ENVS, SimulatorConfig
+from manicm_ms.envs.vec_env import CpuVecEnv, GpuVecEnv, make_vec, resolve_backend
+from manicm_ms.errors import ActionError, BackendError, ConfigError, ManicmError, UnknownNameError
+from manicm_ms.types import AGENT_POS, POINT_CLOUD, STATE, ChunkSpec
+
+OURS = [env_id for env_id in ENVS.names() if not env_id.startswith("toy/")]
+NO_GPU = not torch.cuda.is_available()
+
+
+# ---- conformance ----------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("env_id", [*OURS, SOUND])
+def test_every_registered_environment_keeps_the_promises(env_id):
+    told = []
+    results = check_vec_env(env_id, "cpu", on_result=told.append)
+    assert [f"{r.name}: {r.detail}" for r in results if not r.passed] == []
+    assert len(results) == len(PROPERTIES)
+    assert told == results
+
+
+@pytest.mark.parametrize("env_id", BROKEN)
+def test_a_broken_environment_is_caught(env_id):
+    _, promise = BROKEN[env_id]
+    failed = {r.name: r.detail for r in check_vec_env(env_id, "cpu") if not r.passed}
+    assert promise in failed
+    assert failed[promise], "the detail says what was seen"
+
+
+def test_promises_have_names_of_their_own():
+    names = [check.__name__ for check in PROPERTIES]
+    assert len(set(names)) == len(names) >= 15
+
+
+# ---- a cheap environment of two rows --------------------------------------------------------------------------------
+
+
+@pytest.fixture
+def env():
+    env = make_vec(SOUND, 2, "cpu")
+    env.reset(seed=[1, 2])
+    yield env
+    env.close()
+
+
+def test_says_what_it_is(env):
+    assert env.backend == "cpu"
+    assert env.device == torch.device("cpu")
+    assert env.num_envs == 2
+    assert env.chunk is None
+    assert env.env_spec.env_id == SOUND
+    assert env.env_spec.obs.num_points == 512, "the number of points that was asked for, not the entry's own"
+    assert env.single_observation_space[POINT_CLOUD].shape == (512, 3)
+
+
+def test_values_against_the_closed_form(env):
+    start = env.reset(seed=[1, 2])[0][AGENT_POS]
+    torch.testing.assert_close(start[0], torch.rand(2, generator=torch.Generator().manual_seed(1)) * 0.1)
+    moves = torch.tensor([[0.2, 0.1], [-0.3, 0.0]])
+    obs, reward, terminated, truncated, info = env.step(moves)
+    torch.testing.assert_close(obs[AGENT_POS], start + moves)
+    torch.testing.assert_close(reward, (start + moves)[:, 0])
+    assert reward.dtype == torch.float32
+    assert terminated.tolist() == truncated.tolist() == [False, False]
+    assert info["elapsed_steps"].tolist() == [1, 1]
+
+
+def test_success_terminates_and_freezes(env):
+    for _ in range(2):
+        obs, _, terminated, _, info = env.step(torch.tensor([[0.6, 0.0], [0.0, 0.0]]))
+    assert terminated.tolist() == info["success"].tolist() == [True, False]
+    again, reward, terminated, _, info = env.step(torch.tensor([[0.6, 0.0], [0.1, 0.0]]))
+    assert torch.equal(again[AGENT_POS][0], obs[AGENT_POS][0])
+    assert terminated.tolist() == info["success_once"].tolist() == [True, False]
+    assert reward[0] == 0
+    _, info = env.reset(seed=[3, 4], options={"reset_mask": np.array([True, False])})
+    assert info["success"].tolist() == [False, False]
+    assert info["elapsed_steps"].tolist() == [0, 3]
+
+
+def test_crash_of_a_row_is_told_and_the_other_goes_on(env):
+    for _ in range(5):
+        _, _, terminated, _, info = env.step(torch.tensor([[0.0, 0.9], [-0.1, 0.0]]))
+    assert terminated.tolist() == [True, False]
+    assert info["error"] == ["the simulation diverged: the observation holds NaN or infinity", None]
+    assert info["success"].tolist() == [False, False]
+    _, info = env.reset(seed=[5, 6])
+    assert info["error"] == [None, None]
+
+
+def test_reset_mask_of_nobody_changes_nothing(env):
+    before = env.step(torch.full((2, 2), 0.1))[0]
+    after, info = env.reset(seed=[8, 9], options={"reset_mask": np.zeros(2, dtype=bool)})
+    assert torch.equal(before[AGENT_POS], after[AGENT_POS])
+    assert info["elapsed_steps"].tolist() == [1, 1]
+
+
+def test_seed_forms(env):
+    counted = env.reset(seed=4)[0][AGENT_POS]
+    listed = env.reset(seed=[4, 5])[0][AGENT_POS]
+    assert torch.equal(counted, listed)
+    assert not torch.equal(env.reset()[0][AGENT_POS], env.reset()[0][AGENT_POS])
+
+
+@pytest.mark.parametrize(
+    ("actions", "words"),
+    [
+        (np.full((2, 2), np.nan), "rows [0, 1]"),
+        (np.array([[0, 0], [0, np.inf]]), "rows [1]"),
+        (np.zeros((3, 2)), "(3, 2)"),
+        (np.zeros(2), "takes (2, 2)"),
+        ("left", "not an array"),
+        (None, "not an array"),
+    ],
+)
+def test_bad_actions(env, actions, words):
+    with pytest.raises(ActionError) as error:
+        env.step(actions)
+    assert words in str(error.value)
+    assert "\n" not in str(error.value)
+    _, info = env.reset(seed=[1, 2])
+    assert info["elapsed_steps"].tolist() == [0, 0]
+
+
+def test_bad_resets(env):
+    with pytest.raises(ConfigError, match="3 seeds for num_envs=2"):
+        env.reset(seed=[1, 2, 3])
+    for mask in (np.array([True]), np.array([1, 0])):
+        with pytest.raises(ConfigError, match="reset_mask must be"):
+            env.reset(seed=[1, 2], options={"reset_mask": mask})
+
+
+def test_video_must_be_asked_for(env):
+    with pytest.raises(ConfigError, match="video=True"):
+        env.render_video_frames()
+    with closing(make_vec(SOUND, 2, "cpu", video=True)) as filmed:
+        filmed.reset(seed=[1, 2])
+        frames = filmed.render_video_frames()
+    assert frames.shape == (2, 4, 4, 3)
+    assert frames.dtype == torch.uint8
+
+
+def test_chunks_have_a_history_and_an_action_axis():
+    with closing(make_vec(SOUND, 2, "cpu", chunk=ChunkSpec(2, 4, 3), obs=(AGENT_POS, STATE))) as env:
+        first, _ = env.reset(seed=[1, 2])
+        assert set(first) == {AGENT_POS, STATE}
+        assert first[AGENT_POS].shape == (2, 2, 2)
+        obs, reward, *_, info = env.step(torch.full((2, 3, 2), 0.1))
+        torch.testing.assert_close(obs[AGENT_POS][:, 1], first[AGENT_POS][:, 1] + 0.3)
+        torch.testing.assert_close(reward, 3 * first[AGENT_POS][:, 1, 0] + 0.1 + 0.2 + 0.3)
+        assert info["elapsed_steps"].tolist() == [3, 3]
+        with pytest.raises(ActionError):
+            env.step(torch.zeros(2, 2))
+
+
+# ---- processes ------------------------------------------------------------------------------------------------------
+
+
+def test_killed_worker_is_told_and_closing_still_works():
+    env = make_vec(SOUND, 2, "cpu")
+    env.reset(seed=[1, 2])
+    victim, other = env._workers.processes
+    os.kill(victim.pid, signal.SIGKILL)
+    victim.join()
+    with pytest.raises(BackendError, match=r"worker process \[0\] .* died .*-9.*make it anew"):
+        env.step(torch.zeros(2, 2))
+    env.close()
+    env.close()
+    deadline = time.monotonic() + 20
+    while other.is_alive() and time.monotonic() < deadline:
+        time.sleep(0.05)
+    assert not other.is_alive()
+
+
+def test_closing_ends_the_workers():
+    env = make_vec(SOUND, 1, "cpu")
+    (worker,) = env._workers.processes
+    env.reset(seed=[1])
+    env.close()
+    assert not worker.is_alive()
+
+
+# ---- what cannot be made --------------------------------------------------------------------------------------------
+
+
+def test_unknown_id_suggests_the_nearest():
+    with pytest.raises(UnknownNameError, match="did you mean 'ur3e/slide-block'"):
+        make_vec("ur3e/slideblock")
+
+
+@pytest.mark.parametrize(
+    "options",
+    [
+        {"num_envs": 0},
+        {"num_points": 0},
+        {"image_size": (0, 84)},
+        {"obs": ()},
+        {"obs": ("pointcloud",)},
+    ],
+)
+def test_impossible_options(options):
+    with pytest.raises(ConfigError):
+        make_vec(SOUND, **{"backend": "cpu"} | options)
+
+
+def test_unknown_observation_key_lists_those_that_exist():
+    with pytest.raises(ConfigError, match=r"pointcloud.*point_cloud, agent_pos"):
+        make_vec(SOUND, backend="cpu", obs=("pointcloud",))
+
+
+def test_unknown_backend_lists_those_that_exist():
+    with pytest.raises(BackendError, match="auto, cpu, gpu"):
+        make_vec(SOUND, backend="tpu")
+
+
+@pytest.mark.skipif(not NO_GPU, reason="this machine has a CUDA device")
+def test_gpu_is_refused_with_the_reason_where_there_is_none():
+    with pytest.raises(BackendError, match="finds no CUDA device; use backend 'cpu'") as error:
+        make_vec(SOUND, backend="gpu")
+    assert isinstance(error.value, ManicmError)
+
+
+@pytest.mark.skipif(not NO_GPU, reason="this machine has a CUDA device")
+def test_auto_takes_the_cpu_and_says_so():
+    assert resolve_backend("auto") == "cpu"
+    with closing(make_vec(SOUND)) as env:
+        assert env.backend == "cpu"
+
+
+def test_the_gpu_backend_s_own_code_on_two_rows():
+    """GpuVecEnv with a simulator that lives on the CPU: everything but the physics is the same."""
+    entry, chunk = ENVS.get(SOUND), ChunkSpec(2, 4, 3)
+    rng = torch.Generator().manual_seed(0)
+    plan = torch.rand(6, 2, 3, 2, generator=rng) * 0.3 - 0.15
+    played = []
+    for kind, rows in ((CpuVecEnv, 1), (GpuVecEnv, 2)):
+        config = SimulatorConfig(num_rows=rows)
+        with closing(kind(entry, config.specialise(entry.spec), 2, config, chunk)) as env:
+            frames = [env.reset(seed=[1, 2])]
+            for k, action in enumerate(plan):
+                frames.append(env.step(action))
+                if k == 3:
+                    frames.append(env.reset(seed=[7, 7], options={"reset_mask": np.array([False, True])}))
+            played.append(frames)
+    for cpu, gpu in zip(*played, strict=True):
+        *cpu, cpu_info = cpu
+        *gpu, gpu_info = gpu
+        assert all(torch.equal(cpu[0][key], gpu[0][key]) for key in cpu[0])
+        assert all(torch.equal(a, b) for a, b in zip(cpu[1:], gpu[1:], strict=True))
+        assert set(cpu_info) == set(gpu_info)
+        for name in set(cpu_info) - {"error"}:
+            assert torch.equal(cpu_info[name], gpu_info[name]), name
+        assert cpu_info["error"] == gpu_info["error"] == [None, None]
+
+
+def test_point_mass_is_registered_under_its_module():
+    """Workers import this module by name; the tests above rely on it."""
+    assert ENVS.get(SOUND).module == point_mass_env.__name__
