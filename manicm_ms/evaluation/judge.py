@@ -18,7 +18,7 @@ from manicm_ms.errors import ConfigError, ManicmError
 from manicm_ms.evaluation.latency import Latency, measure_latency
 from manicm_ms.evaluation.machine import machine
 from manicm_ms.evaluation.records import EpisodeLog, claimed_folder
-from manicm_ms.evaluation.report import summary_table, write_report
+from manicm_ms.evaluation.report import crash_lines, paired_sentences, summary_table, write_report
 from manicm_ms.evaluation.rollout import EpisodeResult, RestartableEnv, rollout
 from manicm_ms.evaluation.statistics import compare_paired, success_rate
 from manicm_ms.evaluation.video import Take, choose_seeds, film
@@ -227,6 +227,8 @@ def judge(
         write_json(out / "results.json", results)
         write_report(results, out)
     console.print(summary_table(results))
+    for sentence in (*paired_sentences(results), *crash_lines(results)):
+        console.print(sentence, highlight=False, markup=False)
     console.print(f"report: {out / 'report.html'}", soft_wrap=True)
     return results
 

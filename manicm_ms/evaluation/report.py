@@ -65,7 +65,7 @@ def format_ms(milliseconds: float) -> str:
     return f"{milliseconds:.3g} ms" if milliseconds < 10 else f"{milliseconds:.1f} ms"
 
 
-_HEADERS = ("Policy", "Role", "NFE", "Success", "95 % interval", "Crashed", "Decision, median", "p95", "Measured on")
+_HEADERS = ("Policy", "Role", "NFE", "Success", "95 % interval", "Crashed", "Decision", "p95", "Measured on")
 
 
 def paired_sentences(results: Mapping[str, Any]) -> list[str]:
@@ -83,8 +83,8 @@ def paired_sentences(results: Mapping[str, Any]) -> list[str]:
     ]
     first, second = results["policies"][0]["latency_ms"]["median"], results["policies"][-1]["latency_ms"]["median"]
     sentences.append(
-        f"{pair['second']} decides {first / second:.1f} times as fast as {pair['first']} "
-        f"({results['policies'][-1]['nfe']} network evaluation(s) against {results['policies'][0]['nfe']})."
+        f"The policy {pair['second']} decides {first / second:.1f} times as fast as {pair['first']}: "
+        f"{results['policies'][-1]['nfe']} against {results['policies'][0]['nfe']} network evaluations a decision."
     )
     return sentences
 
@@ -99,15 +99,18 @@ def crash_lines(results: Mapping[str, Any]) -> list[str]:
     ]
 
 
+_PRINTED = ("name", "nfe", "success", "interval", "median", "p95")
+
+
 def summary_table(results: Mapping[str, Any]) -> Table:
-    """Return the table that the command line prints."""
-    table = Table(title=f"{results['env_id']}, {len(results['seeds'])} seeds from {results['seeds'][0]}")
+    """Return the table that the command line prints, narrow enough for 80 columns."""
+    seeds = results["seeds"]
+    table = Table(title=f"{results['env_id']}, seeds {seeds[0]} to {seeds[-1]}")
     for header, key in zip(_HEADERS, Row._fields, strict=True):
-        table.add_column(header, justify="left" if key in ("name", "role", "where") else "right")
+        if key in _PRINTED:
+            table.add_column(header, justify="left" if key == "name" else "right", overflow="fold")
     for row in rows(results):
-        table.add_row(*row)
-    if results["paired"] is not None:
-        table.caption = "\n".join(paired_sentences(results))
+        table.add_row(*(getattr(row, key) for key in _PRINTED))
     return table
 
 
@@ -168,6 +171,7 @@ def latency_plot(results: Mapping[str, Any]) -> str:
             axes.plot([p95], [y], marker="|", ms=13, mew=1.6, color=_INK)
         axes.text(max(median, p95 or 0) * 1.12, y, format_ms(median), va="center", color=_INK)
     axes.set_xscale("log")
+    axes.xaxis.set_major_formatter(lambda value, _: f"{value:g}")
     axes.set_xlim(left, 6 * max(values))
     axes.set_xlabel("one decision, ms, log scale (bar: median, tick: p95; paper: mean on an RTX 4090)")
     _label(axes, [name for name, *_ in entries])

@@ -146,7 +146,7 @@ def _damped_phi(counts: PairedCounts) -> float:
     margins = (a + b) * (c + d) * (a + c) * (b + d)
     if margins == 0:
         return 0.0
-    numerator = a * d - b * c
+    numerator = float(a * d - b * c)
     if numerator > 0:
         numerator = max(numerator - counts.n / 2, 0.0)
     return numerator / math.sqrt(margins)

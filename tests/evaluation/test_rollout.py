@@ -11,6 +11,8 @@ from point_mass import CHUNK, DT, REACH, SPEC, PointMass, Proportional
 
 from manicm_ms.errors import BackendError, ConfigError, SpecMismatchError
 from manicm_ms.evaluation.rollout import MAX_RESTARTS, EpisodeResult, RestartableEnv, decision_noise, rollout
+from manicm_ms.policies.base import make_policy
+from manicm_ms.policies.manicm import ManiCM
 from manicm_ms.types import ActionSpec, ChunkSpec
 
 SEEDS = list(range(100, 123))
@@ -71,6 +73,20 @@ def test_noise_differs_between_seeds_and_decisions_and_not_between_policies():
     np.testing.assert_array_equal(second.actions, again.actions)
     chunks = [c.tobytes() for c in itertools.chain(first.actions, second.actions)]
     assert len(set(chunks)) == len(chunks)
+
+
+@pytest.mark.parametrize("nfe", [None, 4])
+def test_a_network_gives_the_same_bits_in_any_order_and_nearly_the_same_at_any_batch_size(nfe):
+    config = {"network": {"down_dims": (16, 32, 48), "state_widths": (16, 16), "point_widths": (16, 32, 32)}}
+    policy = make_policy("simple_dp3", SPEC, CHUNK, config, seed=0)
+    policy = policy if nfe is None else ManiCM.from_teacher(policy, nfe=nfe)
+    straight = rollout(PointMass(4), policy, SEEDS[:10])
+    shuffled = {r.seed: r for r in rollout(PointMass(4), policy, [*SEEDS[7:2:-1], 99])}  # another order, a part only
+    for result in straight:
+        if result.seed in shuffled:
+            np.testing.assert_array_equal(shuffled[result.seed].actions, result.actions)
+    for result, alone in zip(straight, rollout(PointMass(1), policy, SEEDS[:10]), strict=True):
+        np.testing.assert_allclose(alone.actions[0], result.actions[0], atol=1e-5)
 
 
 def test_policies_that_draw_more_noise_start_from_the_same():
