@@ -285,9 +285,9 @@ PAGE = """# What the distillation formula decides: two-dimensional actions
 Two modes: share of samples on a mode / share on the rarer mode (0.5 at best) / imbalance (0.5: one mode is lost) /
 energy distance to fresh data (0 at best). One mode: root mean square error / scale of the best multiple of the truth.
 
-The public formula's step back does not contain x_t, so a student's two ends of a step carry no common information
-about which action was meant; at two modes it must choose one for all. Its abar_prev[0] = alphas_cumprod[0] leaves
-noise of standard deviation 0.025 in the targets of the lowest time, which costs precision (one mode) with either epsilon.
+The public formula's step back holds x_t only through the teacher's guess at x0, which at noisy times is the mean of
+the modes: all paths meet in one point, and which mode was meant is lost. Its abar_prev[0] = alphas_cumprod[0] leaves
+noise of standard deviation 0.025 in the lowest time's targets, which costs precision (one mode) with either epsilon.
 
 `python scripts/bench_toy.py`: an MLP teacher of {teacher} steps, students of {student} steps that start from it
 (100 noise times, 10 solver steps, mu 0.95, no clipping), {samples} samples a row, the same noise in each.
