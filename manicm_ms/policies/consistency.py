@@ -29,7 +29,7 @@ def boundary_scalings(
     """Return c_skip and c_out of f(x, t) = c_skip(t) x + c_out(t) F(x, t), which make f(x, 0) = x.
 
     c_skip = sigma^2 / ((beta t)^2 + sigma^2), c_out = beta t / sqrt((beta t)^2 + sigma^2)
-    (Chen et al., ManiCM, equation 2; Luo et al. 2023, Latent Consistency Models).
+    (Gao, Lu et al., ManiCM, equation 2; Luo et al. 2023, Latent Consistency Models).
 
     Args:
         t: (B,) times in training steps.

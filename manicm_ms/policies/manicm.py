@@ -1,4 +1,4 @@
-"""The ManiCM student (Chen et al. 2024): the teacher's network run once, or a few times, as a consistency function."""
+"""The ManiCM student (Gao, Lu et al. 2024): the teacher's network as a consistency function of one or a few steps."""
 
 from __future__ import annotations
 
