@@ -14,14 +14,13 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-import gymnasium as gym
 import numpy as np
 import torch
 from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 
 from manicm_ms.demos.experts import EXPERTS, Expert, ExpertFactory
 from manicm_ms.demos.store import OPTIONAL_FIELDS, DemoStore, Episode, frame_shapes
-from manicm_ms.envs.vec_env import make_vec
+from manicm_ms.envs.vec_env import VecEnv, make_vec
 from manicm_ms.errors import ConfigError, ManicmError, StoreError
 from manicm_ms.paths import require_free_space
 from manicm_ms.provenance import package_versions
@@ -74,13 +73,11 @@ class Collector:
         extras: optional fields of `Episode` to record, from `OPTIONAL_FIELDS`.
     """
 
-    def __init__(
-        self, env: gym.vector.VectorEnv, expert: Expert, *, tail_steps: int = 8, extras: Iterable[str] = ()
-    ) -> None:
+    def __init__(self, env: VecEnv, expert: Expert, *, tail_steps: int = 8, extras: Iterable[str] = ()) -> None:
         if tail_steps < 0:
             raise ConfigError(f"tail_steps must not be negative, got {tail_steps}")
         self.env, self.expert, self.tail_steps = env, expert, tail_steps
-        self.spec: EnvSpec = env.env_spec  # type: ignore[attr-defined]
+        self.spec = env.env_spec
         self.fields = ("point_cloud", "agent_pos", *extras)
         self._obs: Mapping[str, Any] = {}
         self._rows: list[_Row | None] = [None] * env.num_envs
@@ -317,7 +314,12 @@ def _finished(
         _require_same_origin(store, asked)
         if len(store) < episodes:
             return None
-        return Collected(out, len(store), attempts_so_far(store, int(asked["seed"])), 0)
+        kept, tried = len(store), attempts_so_far(store, asked["seed"])
+        noted = store.attempts
+    if noted < tried:  # the run that committed the last episode was killed before it noted the attempt
+        with DemoStore.open(out, "a") as store:
+            store.note(attempts=tried)
+    return Collected(out, kept, tried, 0)
 
 
 def _create(out: Path, spec: EnvSpec, provenance: Mapping[str, Any], episodes: int) -> DemoStore:

@@ -108,13 +108,17 @@ from pathlib import Path
 from store_samples import episode, make_store, require_same
 from manicm_ms.demos.store import DemoStore
 base, work = Path(sys.argv[1]), Path(sys.argv[2])
-WATCHED = {"open", "os.rename", "os.remove", "os.mkdir", "os.truncate", "shutil.rmtree"}
+
+def changes_files(event, args):  # between two such moments, a kill finds the same files
+    if event == "open":
+        return args[2] & (os.O_WRONLY | os.O_RDWR | os.O_CREAT)
+    return event in {"os.rename", "os.remove", "os.mkdir", "os.truncate"}
 
 def append_until_killed(moment):
     count = 0
     def hook(event, args):
         nonlocal count
-        if event in WATCHED:
+        if changes_files(event, args):
             if count == moment:
                 os.kill(os.getpid(), signal.SIGKILL)
             count += 1

@@ -1,0 +1,232 @@
+"""Surveying a store: what it holds and what is wrong with it, however broken it is.
+
+Reads the zarr arrays one by one instead of through `DemoStore`, which refuses a damaged store as a whole.
+"""
+
+from __future__ import annotations
+
+import json
+from collections import Counter
+from dataclasses import asdict, dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import zarr
+
+from manicm_ms.demos.store import FORMAT, FRAME_ARRAYS, frame_shapes
+from manicm_ms.errors import ConfigError, StoreError
+from manicm_ms.types import EnvSpec
+
+_REQUIRED = ("point_cloud", "agent_pos", "action")
+_RANGED = ("point_cloud", "agent_pos", "action", "privileged_state")
+_MOST_NAMED = 5  # problems of one kind that are spelled out
+
+
+@dataclass
+class Survey:
+    """What a store holds; its fields are the keys of `manicm-ms inspect --json`.
+
+    Attributes:
+        path: the store.
+        env_id: environment of the demonstrations, or None where the store does not say.
+        episodes: E.
+        frames: control steps of all episodes together.
+        attempts: episodes tried for those that are kept.
+        seeds: (E,) seed of each episode.
+        lengths: (E,) control steps of each episode.
+        success: (E,) whether each was solved.
+        expert: who demonstrated.
+        style: in which style.
+        ranges: field -> channel -> [least, greatest] over all frames.
+        provenance: how the data came about.
+        env_spec: what is fixed about the environment.
+        bytes_on_disk: size of all files.
+        problems: what is wrong, one sentence each; empty for a sound store.
+    """
+
+    path: str
+    env_id: str | None = None
+    episodes: int = 0
+    frames: int = 0
+    attempts: int = 0
+    seeds: list[int] = field(default_factory=list)
+    lengths: list[int] = field(default_factory=list)
+    success: list[bool] = field(default_factory=list)
+    expert: str | None = None
+    style: str | None = None
+    ranges: dict[str, dict[str, list[float]]] = field(default_factory=dict)
+    provenance: dict[str, Any] = field(default_factory=dict)
+    env_spec: dict[str, Any] = field(default_factory=dict)
+    bytes_on_disk: int = 0
+    problems: list[str] = field(default_factory=list)
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return plain JSON values."""
+        return asdict(self)
+
+
+class _Surveyor:
+    """Fills a `Survey` step by step; every step goes on as far as the damage lets it."""
+
+    def __init__(self, path: Path) -> None:
+        self.path = path
+        self.result = Survey(str(path))
+        self.spec: EnvSpec | None = None
+        self.ends = np.zeros(0, np.int64)
+
+    def run(self) -> Survey:
+        self.result.bytes_on_disk = sum(f.stat().st_size for f in self.path.rglob("*") if f.is_file())
+        self._attributes()
+        self._episodes()
+        for name in FRAME_ARRAYS:
+            self._frames(name)
+        return self.result
+
+    def _problem(self, text: str) -> None:
+        self.result.problems.append(text)
+
+    def _attributes(self) -> None:
+        try:
+            attrs = json.loads((self.path / ".zattrs").read_text(encoding="utf-8"))
+        except (OSError, ValueError) as e:
+            self._problem(f"the attributes (.zattrs) cannot be read: {_one_line(e)}")
+            return
+        if not isinstance(attrs, dict) or attrs.get("format") != FORMAT:
+            self._problem(f"the attribute format is not {FORMAT!r}: the store was not written by 'manicm-ms collect'")
+            return
+        try:
+            self.spec = EnvSpec.from_dict(attrs["env_spec"])
+            provenance = dict(attrs["provenance"])
+            self.result.attempts = int(attrs["attempts"])
+        except (KeyError, TypeError, ValueError, AttributeError, ConfigError) as e:
+            self._problem(f"the attributes (.zattrs) are damaged: {_one_line(e)}")
+            return
+        self.result.env_id, self.result.env_spec = self.spec.env_id, json.loads(json.dumps(self.spec.to_dict()))
+        self.result.provenance = provenance
+        self.result.expert, self.result.style = provenance.get("expert"), provenance.get("style")
+
+    def _episodes(self) -> None:
+        ends = self._read("meta/episode_ends")
+        if ends is None:
+            return
+        lengths = np.diff(ends, prepend=0)
+        for k in np.flatnonzero(lengths <= 0)[:_MOST_NAMED]:
+            before = ends[k - 1] if k else 0
+            self._problem(f"meta/episode_ends does not grow: episode {k} ends at frame {ends[k]} after {before}")
+        self.ends = ends
+        self.result.episodes, self.result.frames = len(ends), int(ends[-1]) if len(ends) else 0
+        self.result.lengths = [int(n) for n in lengths]
+        if not len(ends):
+            self._problem("it holds no episode")
+        columns = {name: self._column(name) for name in ("seed", "success", "length")}
+        self.result.seeds = [int(s) for s in columns["seed"]]
+        self.result.success = [bool(s) for s in columns["success"]]
+        for seed, times in Counter(self.result.seeds).items():
+            if times > 1:
+                self._problem(f"seed {seed} occurs {times} times")
+        if len(columns["length"]) == len(lengths) and np.any(columns["length"] != lengths):
+            self._problem("meta/length differs from the lengths that meta/episode_ends gives")
+
+    def _column(self, name: str) -> np.ndarray:
+        values = self._read(f"meta/{name}")
+        if values is None:
+            return np.zeros(0)
+        if len(values) != len(self.ends):
+            self._problem(self._mismatch(f"meta/{name}", len(values), len(self.ends), "episodes"))
+        return values[: len(self.ends)]
+
+    def _mismatch(self, name: str, has: int, committed: int, unit: str) -> str:
+        remedy = ": the last append was cut short, the next 'collect' into it removes the rest" * (has > committed)
+        return f"{name} has {has} {unit} where meta/episode_ends gives {committed}{remedy}"
+
+    def _frames(self, name: str) -> None:
+        disk = f"data/{FRAME_ARRAYS[name]}"
+        if name not in _REQUIRED and not (self.path / disk).exists():
+            return
+        values = self._read(disk)
+        if values is None:
+            return
+        if self.spec is not None:
+            shape, dtype = frame_shapes(self.spec)[name]
+            if values.shape[1:] != shape or values.dtype != dtype:
+                found, wanted = f"{values.shape[1:]} {values.dtype}", f"{shape} {dtype}"
+                self._problem(f"{disk} has frames of {found} where the env spec says {wanted}")
+        if len(values) != self.result.frames:
+            self._problem(self._mismatch(disk, len(values), self.result.frames, "frames"))
+        values = values[: max(self.result.frames, 0)]
+        if values.dtype.kind != "f" or values.ndim < 2 or not len(values):
+            return
+        self._not_finite(disk, values)
+        if name == "point_cloud" and values.ndim == 3:
+            self._empty_clouds(values)
+        if name == "action" and np.nanmax(np.abs(values)) > 1:
+            self._problem(f"{disk} leaves [-1, 1]: it reaches {np.nanmax(np.abs(values)):.3g}")
+        if name in _RANGED:
+            self.result.ranges[name] = self._ranges(name, values)
+
+    def _not_finite(self, disk: str, values: np.ndarray) -> None:
+        bad = np.flatnonzero(~np.isfinite(values).all(axis=tuple(range(1, values.ndim))))
+        self._name_frames(f"NaN or infinity in {disk}", bad)
+
+    def _empty_clouds(self, clouds: np.ndarray) -> None:
+        extent = np.ptp(clouds[..., :3], axis=1).max(axis=1)  # (F,)
+        self._name_frames("empty cloud (all points equal) in data/point_cloud", np.flatnonzero(extent == 0))
+
+    def _name_frames(self, what: str, frames: np.ndarray) -> None:
+        """Name a problem per episode, with its first frame."""
+        numbers = np.searchsorted(self.ends, frames, side="right")
+        episodes, first, count = np.unique(numbers, return_index=True, return_counts=True)
+        for k, at, n in list(zip(episodes, first, count, strict=True))[:_MOST_NAMED]:
+            start = self.ends[k - 1] if k else 0
+            seed = f" (seed {self.result.seeds[k]})" if k < len(self.result.seeds) else ""
+            self._problem(f"{what}: episode {k}{seed}, {n} frame(s), the first is its frame {frames[at] - start}")
+        if len(episodes) > _MOST_NAMED:
+            self._problem(f"{what}: in {len(episodes) - _MOST_NAMED} further episodes")
+
+    def _ranges(self, name: str, values: np.ndarray) -> dict[str, list[float]]:
+        flat = values.reshape(-1, values.shape[-1])
+        flat = np.where(np.isfinite(flat), flat, np.nan)
+        names = self._channel_names(name, flat.shape[1])
+        kept = [k for k in range(flat.shape[1]) if np.isfinite(flat[:, k]).any()]
+        return {names[k]: [float(np.nanmin(flat[:, k])), float(np.nanmax(flat[:, k]))] for k in kept}
+
+    def _channel_names(self, name: str, channels: int) -> list[str]:
+        names: tuple[str, ...] = ()
+        if name == "point_cloud":
+            names = ("x (m)", "y (m)", "z (m)", "r", "g", "b")[:channels]
+        elif self.spec is not None and name == "agent_pos":
+            names = self.spec.agent_pos_names
+        elif self.spec is not None and name == "action":
+            names = self.spec.action.names
+        return list(names) if len(set(names)) == channels else [str(k) for k in range(channels)]
+
+    def _read(self, name: str) -> np.ndarray | None:
+        if not (self.path / name / ".zarray").is_file():
+            self._problem(f"{name} is missing")
+            return None
+        try:
+            values = np.asarray(zarr.open_array(str(self.path / name), mode="r", zarr_format=2)[:])
+        except Exception as e:  # a damaged array may raise anything in zarr, numcodecs or json
+            self._problem(f"{name} cannot be read: {_one_line(e)}")
+            return None
+        if values.ndim == 0 or (name.startswith("meta/") and values.ndim != 1):
+            self._problem(f"{name} has the shape {values.shape}")
+            return None
+        return values
+
+
+def survey(path: Path) -> Survey:
+    """Return what the store at `path` holds, with its problems named.
+
+    Raises StoreError only where no zarr group stands at `path`; any other damage is a problem of the survey.
+    """
+    if not path.is_dir():
+        raise StoreError(f"no store at {path}: make one with 'manicm-ms collect ENV --out {path}'")
+    if not (path / ".zgroup").is_file() and not (path / "meta").is_dir():
+        raise StoreError(f"{path} is not a store of demonstrations (a zarr group of format 2)")
+    return _Surveyor(path).run()
+
+
+def _one_line(error: Exception) -> str:
+    return " ".join(f"{type(error).__name__}: {error}".split())[:200]
