@@ -29,7 +29,7 @@ from manicm_ms.errors import RenderDeviceError
 FOLDER_VARIABLE = "MANICM_MS_VULKAN"
 USE_SYSTEM = "system"
 MANIFEST = "vulkan.json"
-REMEDY = "run 'make setup' in the repository, or install an NVIDIA driver or Mesa's lavapipe 24.3 or newer"
+REMEDY = "run 'make setup FORCE=1' in the repository, or install an NVIDIA driver or Mesa's lavapipe 24.3 or newer"
 
 _DRIVER_VARIABLE = "VK_DRIVER_FILES"
 _PROBE_PIXELS = 8

@@ -18,13 +18,12 @@ CODE_AND_DATA = {".py", ".typed", ".urdf", ".glb", ".obj", ".stl", ".ply", ".ver
 }  # fmt: skip
 
 
-def expected_files() -> set[str]:
-    """Name inside the wheel of every file under the three source folders that belongs there."""
+def expected_files(source: Path) -> set[str]:
+    """Name inside the wheel of every file under the three source folders."""
     found = set()
     for folder, target in MAPPED.items():
-        for path in (REPO / folder).rglob("*"):
-            if path.is_file() and "__pycache__" not in path.parts:
-                found.add(f"{target}/{path.relative_to(REPO / folder).as_posix()}")
+        files = (path for path in (source / folder).rglob("*") if path.is_file())
+        found |= {f"{target}/{path.relative_to(source / folder).as_posix()}" for path in files}
     return found
 
 
@@ -85,16 +84,16 @@ def ask_installed(installed: Path, code: str) -> dict:
     return json.loads(done.stdout.splitlines()[-1])
 
 
-def test_the_wheel_holds_every_file_of_the_tree(built):
+def test_the_wheel_holds_every_file_of_the_tree(source, built):
     inside = set(zipfile.ZipFile(next(built.glob("*.whl"))).namelist())
-    missing = expected_files() - inside
+    missing = expected_files(source) - inside
     assert not missing, f"add the package or the file's ending to setup.cfg: {sorted(missing)}"
-    strangers = {n for n in inside if not n.startswith("manicm_ms-")} - expected_files()
+    strangers = {n for n in inside if not n.startswith("manicm_ms-")} - expected_files(source)
     assert not strangers
 
 
-def test_the_kinds_of_file_are_known():
-    endings = {Path(name).suffix for name in expected_files()}
+def test_the_kinds_of_file_are_known(source):
+    endings = {Path(name).suffix for name in expected_files(source)}
     assert endings <= CODE_AND_DATA, "a new kind of file: is it meant to be shipped? then add it here and to setup.cfg"
 
 
