@@ -113,7 +113,7 @@ class UR3eTabletopEnv(BaseEnv):
     def _load_objects(self) -> dict[str, Actor]:
         """Build the task's objects; return them by name, in the order of the privileged state."""
 
-    def _load_agent(self, options: dict[str, Any]) -> None:  # type: ignore[override]
+    def _load_agent(self, options: dict[str, Any]) -> None:
         super()._load_agent(options, sapien.Pose())
 
     def _load_scene(self, options: dict[str, Any]) -> None:

@@ -59,13 +59,13 @@ class VecEnv(VectorEnv[Obs, Tensor, Tensor]):
     def __init__(self, spec: EnvSpec, num_envs: int, obs: tuple[str, ...], chunk: ChunkSpec | None) -> None:
         self.env_spec, self.num_envs, self.chunk = spec, num_envs, chunk
         self.metadata = {"autoreset_mode": AutoresetMode.DISABLED, "render_modes": ["rgb_array"]}
-        self.single_observation_space = observation_space(spec, obs, chunk and chunk.n_obs_steps)
-        self.single_action_space = action_space(spec, chunk and chunk.n_action_steps)
+        self.single_observation_space = observation_space(spec, obs, chunk.n_obs_steps if chunk else None)
+        self.single_action_space = action_space(spec, chunk.n_action_steps if chunk else None)
         self.observation_space = batch_space(self.single_observation_space, num_envs)
         self.action_space = batch_space(self.single_action_space, num_envs)
 
     @abstractmethod
-    def reset(  # type: ignore[override]
+    def reset(
         self, *, seed: int | Sequence[int] | None = None, options: dict[str, Any] | None = None
     ) -> tuple[Obs, Info]:
         """Start new episodes.
@@ -79,7 +79,7 @@ class VecEnv(VectorEnv[Obs, Tensor, Tensor]):
         """
 
     @abstractmethod
-    def step(self, actions: ArrayLike | Tensor) -> tuple[Obs, Tensor, Tensor, Tensor, Info]:  # type: ignore[override]
+    def step(self, actions: ArrayLike | Tensor) -> tuple[Obs, Tensor, Tensor, Tensor, Info]:
         """Play actions (N, Da), or chunks (N, Ta, Da), normalised to [-1, 1].
 
         Returns:
@@ -95,7 +95,7 @@ class VecEnv(VectorEnv[Obs, Tensor, Tensor]):
     def render_video_frames(self) -> Tensor:
         """Return what the wide camera sees, (N, H, W, 3) uint8; needs `make_vec(..., video=True)`."""
 
-    def render(self) -> tuple[np.ndarray, ...]:  # type: ignore[override]
+    def render(self) -> tuple[np.ndarray, ...]:
         """Return the N video frames as arrays (Gymnasium's form of `render_video_frames`)."""
         return tuple(self.render_video_frames().cpu().numpy())
 
@@ -152,7 +152,7 @@ class CpuVecEnv(VecEnv):
         self._info: dict[str, np.ndarray] = {}
         self._video = config.video
 
-    def reset(  # type: ignore[override]
+    def reset(
         self, *, seed: int | Sequence[int] | None = None, options: dict[str, Any] | None = None
     ) -> tuple[Obs, Info]:
         """See `VecEnv.reset`."""
@@ -163,7 +163,7 @@ class CpuVecEnv(VecEnv):
             obs, info = self._workers.observations, {}
         return self._tensors(obs), self._merged(info, mask)
 
-    def step(self, actions: ArrayLike | Tensor) -> tuple[Obs, Tensor, Tensor, Tensor, Info]:  # type: ignore[override]
+    def step(self, actions: ArrayLike | Tensor) -> tuple[Obs, Tensor, Tensor, Tensor, Info]:
         """See `VecEnv.step`."""
         checked = self._check_actions(actions).numpy()
         obs, reward, terminated, truncated, info = self._guarded(self._workers.step, checked)
@@ -222,7 +222,7 @@ class GpuVecEnv(VecEnv):
         self._video = config.video
         self._history: Obs = {}
 
-    def reset(  # type: ignore[override]
+    def reset(
         self, *, seed: int | Sequence[int] | None = None, options: dict[str, Any] | None = None
     ) -> tuple[Obs, Info]:
         """See `VecEnv.reset`."""
@@ -233,7 +233,7 @@ class GpuVecEnv(VecEnv):
             self._history, _ = self._rows.reset(where, [seeds[k] for k in rows])
         return self._unchunk(self._history), self._with_errors(self._rows.info())
 
-    def step(self, actions: ArrayLike | Tensor) -> tuple[Obs, Tensor, Tensor, Tensor, Info]:  # type: ignore[override]
+    def step(self, actions: ArrayLike | Tensor) -> tuple[Obs, Tensor, Tensor, Tensor, Info]:
         """See `VecEnv.step`."""
         checked = self._check_actions(actions)
         self._history, reward, info = self._rows.step(checked if self.chunk else checked[:, None])

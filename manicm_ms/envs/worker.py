@@ -31,7 +31,7 @@ def observation_space(spec: EnvSpec, obs: tuple[str, ...], n_obs_steps: int | No
     boxes: dict[str, spaces.Space[Any]] = {}
     for key in obs:
         low, high, dtype = (0, 255, np.uint8) if key == IMAGE else (-np.inf, np.inf, np.float32)
-        boxes[key] = spaces.Box(low, high, history + shapes[key], dtype)  # type: ignore[arg-type]
+        boxes[key] = spaces.Box(low, high, history + shapes[key], dtype)
     return spaces.Dict(boxes)
 
 
@@ -55,11 +55,13 @@ class RowEnv(gymnasium.Env[dict[str, np.ndarray], np.ndarray]):
         self._env_id, self._task_module, self._config, self._chunk = env_id, task_module, config, chunk
         importlib.import_module(task_module)  # registers the id in this process, and only this one
         self.env_spec = config.specialise(ENVS.get_registered(env_id).spec)
-        self.observation_space = observation_space(self.env_spec, config.obs, chunk and chunk.n_obs_steps)
-        self.action_space = action_space(self.env_spec, chunk and chunk.n_action_steps)
+        self.observation_space: spaces.Space[Any] = observation_space(
+            self.env_spec, config.obs, chunk.n_obs_steps if chunk else None
+        )
+        self.action_space = action_space(self.env_spec, chunk.n_action_steps if chunk else None)
         self._rows: ActionChunk | None = None
 
-    def reset(  # type: ignore[override]
+    def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
         """Start the episode that belongs to `seed` (drawn at random where it is None)."""
@@ -87,7 +89,7 @@ class RowEnv(gymnasium.Env[dict[str, np.ndarray], np.ndarray]):
         ended = bool(self._rows.terminated[0]), bool(self._rows.truncated[0])
         return self._unbatch(history), float(reward[0]), *ended, self._plain(info)
 
-    def render(self) -> np.ndarray:  # type: ignore[override]
+    def render(self) -> np.ndarray:
         """Return what the wide camera sees, (H, W, 3) uint8."""
         assert self._rows is not None, "reset before the first frame"
         return self._rows.simulator.render_video_frames()[0].cpu().numpy()
