@@ -15,7 +15,7 @@ from lightning_fabric import Fabric
 from rich.console import Console
 from torch import Tensor, nn
 
-from manicm_ms.errors import TrainingDivergedError
+from manicm_ms.errors import CheckpointError, TrainingDivergedError
 from manicm_ms.paths import require_free_space
 from manicm_ms.training.interrupt import stop_requests
 from manicm_ms.training.log import LossBar, RunLog, loss_bar
@@ -149,7 +149,10 @@ class _Training:
         missing, unexpected = self.objective.load_state_dict(_under("objective.", tensors), strict=False)
         unsaved = [k for k in missing if not k.startswith(self.objective.constant)]
         if unsaved or unexpected:
-            raise RuntimeError(f"training state and objective differ in {(unsaved + unexpected)[:3]}")
+            raise CheckpointError(
+                f"the training state in {run.folder} is of another version of the package (first difference: "
+                f"{(unsaved + unexpected)[0]}): delete that folder to train from the beginning"
+            )
         unpack_optimizer(self.optimizer, _under("optimizer.", tensors), meta["param_groups"])
         self.scheduler.load_state_dict(meta["scheduler"])
         self.fabric.strategy.precision.load_state_dict(meta["precision"])
@@ -199,6 +202,7 @@ def fit(
         title: of the progress bar.
 
     Raises:
+        CheckpointError: the saved state is damaged, or of another version of the package.
         TrainingDivergedError: the loss became NaN or infinite; the last saved state is a finite one.
         NoSpaceError: the disk is too small, or full.
     """

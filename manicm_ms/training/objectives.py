@@ -71,7 +71,7 @@ class DiffusionObjective(PolicyObjective):
 class Distillation(PolicyObjective):
     """Makes a student agree with its own moving average one solver step further down the teacher's path.
 
-    L = E |f(x_{n+k}, t_{n+k}) - f^-(x_n, t_n)|^2 (Gao, Lu et al., ManiCM, equation 5), with noise added to
+    L = E |f(x_{n+k}, t_{n+k}) - f^-(x_n, t_n)|^2 (Gao, Lu et al., ManiCM, equation 3), with noise added to
     demonstrated actions, x_n from the teacher, and f^- the target network. Only the U-Net is trained: the
     encoder stays the teacher's, so that windows come as features (`FeatureWindows`). The outcome is f, not f^-.
 

@@ -81,7 +81,12 @@ class RunFolder:
         if not path.exists():
             write_json(path, self.identity)
             return
-        there = json.loads(path.read_text())
+        try:
+            there = json.loads(path.read_text(encoding="utf-8"))
+        except ValueError:
+            raise OutputExistsError(
+                f"{path} is damaged, so it cannot be told what {self.folder} holds: choose another --out, or delete it"
+            ) from None
         if differences := _differences(there, self.identity):
             raise OutputExistsError(
                 f"{self.out} already holds another run ({'; '.join(differences[:3])}): choose another --out, "

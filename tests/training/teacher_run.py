@@ -9,7 +9,7 @@ from manicm_ms.training.teacher import train_teacher
 
 PRESET = replace(
     TEACHER_PRESETS.get("quick"),
-    steps=60,
+    steps=80,
     batch_size=32,
     points=32,
     down_dims=(16, 32),

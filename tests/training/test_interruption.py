@@ -56,7 +56,7 @@ def test_kill_9_and_the_same_command_gives_the_same_checkpoint(data, whole, tmp_
     assert not out.exists()
     train(data, out)
     assert weights_hash(out) == weights_hash(whole)
-    assert [line["step"] for line in read_log(training_folder(out) / "log.jsonl")] == list(range(1, 61))
+    assert [line["step"] for line in read_log(training_folder(out) / "log.jsonl")] == list(range(1, 81))
 
 
 def test_ctrl_c_says_where_the_state_is_and_the_same_command_goes_on(data, whole, tmp_path):
@@ -95,7 +95,7 @@ def test_two_processes_share_a_batch(data, whole, tmp_path):
     one, two = (load_file(folder / "model.safetensors") for folder in (whole, out))
     assert one.keys() == two.keys()
     logs = [read_log(training_folder(folder) / "log.jsonl") for folder in (whole, out)]
-    assert [line["step"] for line in logs[1]] == list(range(1, 61))
+    assert [line["step"] for line in logs[1]] == list(range(1, 81))
     late = [sum(line["loss"] for line in log[-20:]) / 20 for log in logs]
     assert late[1] == pytest.approx(late[0], rel=0.5)
     assert all(torch.isfinite(v).all() for v in two.values())

@@ -15,7 +15,7 @@ import torch
 from rich.console import Console
 from tiny_run import CONFIG, IDENTITY, TinyData, TinyObjective, train
 
-from manicm_ms.errors import NoSpaceError, OutputExistsError, TrainingDivergedError
+from manicm_ms.errors import CheckpointError, NoSpaceError, OutputExistsError, TrainingDivergedError
 from manicm_ms.training.log import read_log
 from manicm_ms.training.run_folder import open_run, training_folder
 
@@ -200,6 +200,26 @@ def test_tensorboard_has_the_logged_losses(uninterrupted):
     events = board.Scalars("loss")
     assert [e.step for e in events] == [line["step"] for line in log]
     assert [e.value for e in events] == pytest.approx([line["loss"] for line in log])
+
+
+def test_damaged_files_of_a_run_are_named(tmp_path):
+    out = tmp_path / "run"
+    train(out)
+    state = training_folder(out) / "state.safetensors"
+    state.write_bytes(state.read_bytes()[:-100])
+    with pytest.raises(CheckpointError, match=r"state\.safetensors is damaged"):
+        train(out)
+    (training_folder(out) / "run.json").write_text("{")
+    with pytest.raises(OutputExistsError, match=r"run\.json is damaged"):
+        train(out)
+
+
+def test_state_of_another_network_is_refused(tmp_path):
+    out = tmp_path / "run"
+    with open_run(out, IDENTITY) as run:
+        run.save_state({"objective.head.weight": torch.zeros(1)}, {"step": 3})
+    with pytest.raises(CheckpointError, match="another version"):
+        train(out)
 
 
 def test_run_json_is_the_identity(uninterrupted):

@@ -69,7 +69,7 @@ class SlowData(TinyData):
     """The same data, at a pace that leaves time for a signal to land between two steps."""
 
     def batch(self, indices):
-        time.sleep(0.02)
+        time.sleep(0.05)
         return super().batch(indices)
 
 
