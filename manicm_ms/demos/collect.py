@@ -33,6 +33,9 @@ _OBS_OF_FIELD = {
     "depth": DEPTH,
     "privileged_state": STATE,
 }
+TAIL_STEPS = 8
+"""Control steps kept after the first success, so that a policy also sees the solved task and learns to rest."""
+
 # Beyond these failures an expert is broken, not unlucky.
 _FAILURES_PER_EPISODE, _FAILURES_FREE = 10, 50
 _IDENTITY = ("env_id", "seed", "expert", "style", "tail_steps", "fields", "point_channels", "backend")
@@ -73,7 +76,9 @@ class Collector:
         extras: optional fields of `Episode` to record, from `OPTIONAL_FIELDS`.
     """
 
-    def __init__(self, env: VecEnv, expert: Expert, *, tail_steps: int = 8, extras: Iterable[str] = ()) -> None:
+    def __init__(
+        self, env: VecEnv, expert: Expert, *, tail_steps: int = TAIL_STEPS, extras: Iterable[str] = ()
+    ) -> None:
         if tail_steps < 0:
             raise ConfigError(f"tail_steps must not be negative, got {tail_steps}")
         self.env, self.expert, self.tail_steps = env, expert, tail_steps
@@ -192,7 +197,7 @@ def collect(
     backend: str = "auto",
     colors: bool = False,
     extras: Iterable[str] = (),
-    tail_steps: int = 8,
+    tail_steps: int = TAIL_STEPS,
 ) -> Collected:
     """Collect demonstrations of the registered expert of `env_id` into a store, with a progress bar.
 
@@ -349,7 +354,8 @@ def _require_same_origin(store: DemoStore, asked: Mapping[str, Any], spec: EnvSp
 def _command(asked: Mapping[str, Any], episodes: int, extras: tuple[str, ...], colors: bool) -> str:
     """Return the command that makes the same data (the number of environments has no part in it)."""
     words = ["manicm-ms", "collect", asked["env_id"], "--episodes", episodes, "--seed", asked["seed"]]
-    words += ["--style", asked["style"], "--backend", asked["backend"], "--tail-steps", asked["tail_steps"]]
+    words += ["--style", asked["style"], "--backend", asked["backend"]]
+    words += ["--tail-steps", asked["tail_steps"]] if asked["tail_steps"] != TAIL_STEPS else []
     words += ["--colors"] if colors else []
     words += ["--extras", *extras] if extras else []
     return shlex.join(str(w) for w in words)

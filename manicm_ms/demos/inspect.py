@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import base64
 import io
-import json as json_module
+import json
 from pathlib import Path
 from typing import Any
 
@@ -21,25 +21,25 @@ _MOST_EPISODES, _MOST_FRAMES = 6, 60  # in a page, about 200 kB an episode
 _STRIP_FRAMES = 8
 
 
-def inspect(store: Path, html: Path | None = None, json: bool = False) -> int:
+def inspect(store: Path, html: Path | None = None, as_json: bool = False) -> int:
     """Print what a store holds; return the exit status, 1 where something is wrong with it.
 
     Args:
         store: the store.
         html: write a self-contained page to this file: summary, clouds to turn, picture strips.
-        json: print the fields of `Survey` as JSON instead of tables.
+        as_json: print the fields of `Survey` as JSON instead of tables.
 
     Raises StoreError where there is no store at all.
     """
     found = survey(Path(store))
     console = Console(highlight=False)
-    if json:
-        print(json_module.dumps(found.to_dict(), indent=2, allow_nan=False))
+    if as_json:
+        print(json.dumps(found.to_dict(), indent=2, allow_nan=False))
     else:
         _print_summary(console, found)
     if html is not None:
         write_page(Path(store), found, Path(html))
-        if not json:
+        if not as_json:
             console.print(f"page written to {html}", soft_wrap=True)
     return 1 if found.problems else 0
 
@@ -125,7 +125,7 @@ def _cloud_strip(clouds: np.ndarray, steps: np.ndarray) -> str:
         colors = clouds[k, :, 3:].clip(0, 1) if clouds.shape[-1] == 6 else clouds[k, :, 2]
         axes.scatter(*clouds[k, :, :3].T, c=colors, s=2, cmap="viridis", vmin=low[2], vmax=high[2])
         axes.set(xlim=(low[0], high[0]), ylim=(low[1], high[1]), zlim=(low[2], high[2]))
-        axes.set_box_aspect(np.maximum(high - low, 1e-3))
+        axes.set_box_aspect(np.maximum(high - low, 1e-3), zoom=1.5)
         axes.view_init(elev=25, azim=-60)
         axes.set_axis_off()
         axes.set_title(f"step {steps[k]}", fontsize=8)

@@ -28,7 +28,7 @@ def sound(tmp_path_factory):
 
 
 def test_json_summary(sound, capsys):
-    assert inspect(sound, json=True) == 0
+    assert inspect(sound, as_json=True) == 0
     found = json.loads(capsys.readouterr().out)
     episodes = [episode(s) for s in SEEDS]
     assert found["env_id"] == SPEC.env_id
@@ -103,7 +103,7 @@ def test_damage_is_named(sound, tmp_path, capsys, kind):
     path = tmp_path / "a.zarr"
     shutil.copytree(sound, path)
     damage(path)
-    assert inspect(path, json=True) == 1
+    assert inspect(path, as_json=True) == 1
     problems = json.loads(capsys.readouterr().out)["problems"]
     assert any(re.search(named, p) for p in problems), problems
     assert inspect(path, html=tmp_path / "page.html") == 1
