@@ -31,7 +31,7 @@ ALLOWED = {
     "doctor": {"vulkan"},
 }
 MAY_SIMULATE = {"robots", "envs", "tasks", "vulkan"}
-UNBOUND = {"cli", "listing"}  # the command line: may import everything, nobody imports it
+UNBOUND = {"cli"}  # the command line: may import everything, nobody imports it
 
 
 def modules() -> dict[str, Path]:

@@ -135,7 +135,7 @@ def evaluate_command(
         device: torch device of the policies.
         control: add the teacher run in one step, without distillation.
         videos: seeds filmed.
-        threads: torch threads while latency is measured.
+        threads: torch threads while policies act and latency is measured.
     """
     from manicm_ms.evaluation.judge import evaluate
 

@@ -15,7 +15,7 @@ from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 
 from manicm_ms.errors import ConfigError, ManicmError
-from manicm_ms.evaluation.latency import Latency, measure_latency
+from manicm_ms.evaluation.latency import Latency, measure_latency, torch_threads
 from manicm_ms.evaluation.machine import machine
 from manicm_ms.evaluation.records import EpisodeLog, claimed_folder
 from manicm_ms.evaluation.report import crash_lines, paired_sentences, summary_table, write_report
@@ -59,7 +59,7 @@ class Protocol:
         env_id: the environment.
         seeds: one episode each.
         num_envs: rows that run in parallel; does not change the conditions of an episode.
-        threads: torch's intra-op threads while latency is measured.
+        threads: torch's intra-op threads while policies act and latency is measured.
         repetitions: timed decisions per policy.
         videos: seeds filmed, for each of teacher and student.
     """
@@ -123,7 +123,7 @@ def evaluate(
         device: torch device of the policies.
         control: add the teacher run in one step, without distillation, between teacher and student.
         videos: seeds filmed for teacher and student.
-        threads: torch threads while latency is measured.
+        threads: torch threads while policies act and latency is measured.
         repetitions: timed decisions per policy.
         command: the command line to print in the report; None writes the equivalent of this call.
         console: where progress and table are printed; None is standard output.
@@ -326,7 +326,8 @@ def _play(
             bar = progress.add_task(contender.name, total=len(protocol.seeds), completed=done, successes="")
             if missing:
                 home = bench.home(contender)
-                rollout(home, contender.policy, missing, on_episode=_recorder(log, progress, bar))
+                with torch_threads(protocol.threads):  # more fight the workers for the cores
+                    rollout(home, contender.policy, missing, on_episode=_recorder(log, progress, bar))
             results[contender.name] = [log[s] for s in protocol.seeds]
             progress.update(bar, successes=f"{sum(e.success for e in results[contender.name])} successes")
         return results, bench.spec or contenders[0].policy.spec
