@@ -166,6 +166,7 @@ def shares(env_id: str, steps: int) -> dict[str, float]:
 def _watch_parts(watch: Stopwatch, simulator: ManiSkillSimulator) -> None:
     env = simulator.env
     watch.watch(env.scene, "step", "physics")
+    watch.watch(simulator, "_shoot", "rendering")
     watch.watch(simulator, "_pictures", "rendering")
     watch.watch(simulator, "_cloud", "cloud (frame, crop, sampling)")
     watch.watch(env.agent, "set_action", "controller (limits, inverse kinematics)")

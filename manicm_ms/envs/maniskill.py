@@ -67,13 +67,21 @@ class ManiSkillSimulator(Simulator):
         """See `Simulator.observe`."""
         frame: dict[str, Tensor] = {}
         wanted = self.config.obs
+        pictures = bool(_RENDERED.intersection(wanted))
+        if pictures:
+            self._shoot()  # the renderer works while the robot's own state is read
         if AGENT_POS in wanted:
             frame[AGENT_POS] = self.env.agent_pos()
         if STATE in wanted:
             frame[STATE] = self.env.privileged_state()
-        if _RENDERED.intersection(wanted):
+        if pictures:
             frame |= self._render(wanted)
         return frame
+
+    def _shoot(self) -> None:
+        """Start rendering the present scene; `_pictures` waits for it."""
+        self.env.scene.update_render(update_sensors=True, update_human_render_cameras=False)
+        self._camera.capture()
 
     def _render(self, wanted: tuple[str, ...]) -> dict[str, Tensor]:
         pictures = self._pictures(color=IMAGE in wanted or self.config.colors)
@@ -89,8 +97,6 @@ class ManiSkillSimulator(Simulator):
 
     def _pictures(self, color: bool) -> dict[str, Tensor]:
         names = [CLOUD_POSITION, COLOR] if color else [CLOUD_POSITION]
-        self.env.scene.update_render(update_sensors=True, update_human_render_cameras=False)
-        self._camera.capture()
         return dict(zip(names, self._camera.camera.get_picture(names), strict=True))
 
     def _cloud(self, position: Tensor, color: Tensor | None) -> Tensor:
