@@ -367,7 +367,7 @@ class DemoStore:
         if not self._dirty:
             return
         for stray in (*self.path.rglob("*.partial"), *self.path.rglob(".*.tmp")):
-            stray.unlink()
+            stray.unlink(missing_ok=True)
         # Handles are opened anew: the sizes they remember may be those of before the failed append.
         self._group = zarr.open_group(str(self.path), mode="r+", zarr_format=2)
         for field in self._fields:
@@ -444,8 +444,12 @@ def _read_ends(path: Path) -> np.ndarray:
 
 def _extend(array: zarr.Array, start: int, rows: np.ndarray) -> None:
     """Make `array` end with `rows`, which begin at row `start`."""
-    array.resize((start + len(rows), *array.shape[1:]))
-    array[start:] = rows
+    stop, chunk = start + len(rows), array.chunks[0]
+    array.resize((stop, *array.shape[1:]))
+    # One chunk at a time: where a write fails, none is under way in zarr's other threads.
+    for low in range(start - start % chunk, stop, chunk):
+        first, last = max(low, start), min(low + chunk, stop)
+        array[first:last] = rows[first - start : last - start]
 
 
 def _shorten(array: zarr.Array, length: int) -> None:
