@@ -7,7 +7,7 @@ import re
 import shlex
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import ExitStack
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
@@ -135,14 +135,17 @@ def evaluate(
         UnknownNameError, CheckpointError, SpecMismatchError, ConfigError, OutputExistsError, NoSpaceError,
         BackendError.
     """
+    from manicm_ms.envs.simulator import ENVS
     from manicm_ms.envs.vec_env import default_num_envs, make_vec, resolve_backend
 
     if episodes < 1:
         raise ConfigError(f"--episodes must be at least 1, got {episodes}")
     rows = min(num_envs or default_num_envs(), episodes)
     protocol = Protocol(env_id, tuple(range(seed, seed + episodes)), rows, threads, repetitions, videos)
+    spec, backend = ENVS.get(env_id).spec, resolve_backend(backend)
     contenders = load_contenders(checkpoints, device, control)
-    backend = resolve_backend(backend)
+    for contender in contenders:
+        _require_made_for(spec, contender)
 
     def for_policy(policy: Policy, n: int) -> VecEnv:
         obs = policy.spec.obs
@@ -191,6 +194,15 @@ def load_contenders(checkpoints: Sequence[Path], device: str = "cpu", control: b
         one_step = OneStepTeacher(first.policy)
         contenders.insert(1, Contender(f"{first.name}, one step", CONTROL, first.checkpoint, one_step))
     return contenders
+
+
+def _require_made_for(spec: EnvSpec, contender: Contender) -> None:
+    """Raise SpecMismatchError before anything is written where the environment cannot serve the policy."""
+    colors = contender.policy.spec.obs.point_channels  # the environment is made with or without, as the policy wants
+    offered = replace(spec, obs=replace(spec.obs, point_channels=colors))
+    require_compatible(
+        offered, contender.policy.spec, f"environment {spec.env_id}", f"checkpoint {contender.checkpoint}"
+    )
 
 
 def checkpoint_digest(folder: str) -> str:

@@ -1,0 +1,86 @@
+"""`evaluate` on the real environment, from real checkpoint folders, and what it refuses before it writes."""
+
+import dataclasses
+import io
+import json
+
+import pytest
+from rich.console import Console
+
+from manicm_ms.envs.simulator import ENVS
+from manicm_ms.errors import CheckpointError, ConfigError, SpecMismatchError, UnknownNameError
+from manicm_ms.evaluation.judge import evaluate
+from manicm_ms.policies.base import make_policy
+from manicm_ms.policies.checkpoint import save_checkpoint
+from manicm_ms.policies.manicm import ManiCM
+from manicm_ms.types import ChunkSpec
+
+ENV = "ur3e/slide-block"
+CONFIG = {"network": {"down_dims": (16, 32, 48), "max_points": 64}}
+
+
+@pytest.fixture(scope="module")
+def pair(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("pair")
+    teacher = make_policy("simple_dp3", ENVS.get(ENV).spec, ChunkSpec(2, 4, 3), CONFIG, seed=0)
+    save_checkpoint(teacher, folder / "teacher", {})
+    save_checkpoint(ManiCM.from_teacher(teacher), folder / "student", {})
+    return [folder / "teacher", folder / "student"]
+
+
+def run(checkpoints, out, env_id=ENV, episodes=2, **options):
+    console = Console(file=io.StringIO(), width=120)
+    return evaluate(
+        checkpoints,
+        env_id,
+        episodes,
+        100_000,
+        out,
+        num_envs=2,
+        backend="cpu",
+        repetitions=2,
+        console=console,
+        **options,
+    )
+
+
+def test_a_pair_of_checkpoints_is_judged_with_its_control_and_filmed(pair, tmp_path):
+    results = run(pair, tmp_path / "report", videos=1)
+    stored = json.loads((tmp_path / "report" / "results.json").read_text())
+    assert stored == json.loads(json.dumps(results))
+    assert [(p["name"], p["role"], p["nfe"]) for p in stored["policies"]] == [
+        ("teacher", "teacher", 10),
+        ("teacher, one step", "control", 1),
+        ("student", "student", 1),
+    ]
+    assert stored["seeds"] == [100_000, 100_001]
+    assert all(p["n"] == 2 and p["crashed"] == 0 for p in stored["policies"])
+    assert all(e["steps"] > 0 for p in stored["policies"] for e in p["episodes"])
+    films = [(v["policy"], v["seed"]) for v in stored["videos"]]
+    assert films == [("teacher", 100_000), ("student", 100_000)]
+    assert str(pair[0]) in stored["command"]
+
+
+def test_without_control_only_the_checkpoints_are_judged(pair, tmp_path):
+    results = run(pair, tmp_path / "report", episodes=1, control=False, videos=0)
+    assert [p["name"] for p in results["policies"]] == ["teacher", "student"]
+
+
+def test_bad_input_is_refused_before_anything_is_written(pair, tmp_path):
+    out = tmp_path / "report"
+    with pytest.raises(UnknownNameError, match="did you mean 'ur3e/slide-block'"):
+        run(pair, out, env_id="ur3e/slide-blok")
+    with pytest.raises(CheckpointError, match="nowhere"):
+        run([tmp_path / "nowhere"], out)
+    with pytest.raises(ConfigError, match="--episodes"):
+        run(pair, out, episodes=0)
+    with pytest.raises(ConfigError, match="at least one checkpoint"):
+        run([], out)
+    with pytest.raises(ConfigError, match="one name"):
+        run([pair[0], pair[0]], out)
+    spec = ENVS.get(ENV).spec
+    stranger = dataclasses.replace(spec, action=dataclasses.replace(spec.action, control_hz=50.0))
+    save_checkpoint(make_policy("simple_dp3", stranger, ChunkSpec(2, 4, 3), CONFIG, seed=0), tmp_path / "stranger", {})
+    with pytest.raises(SpecMismatchError, match="control_hz"):
+        run([tmp_path / "stranger"], out)
+    assert not out.exists()
