@@ -67,14 +67,21 @@ def _split(picture: torch.Tensor) -> dict[str, torch.Tensor]:
     return {"position": position, "depth": -position[..., 2:], "segmentation": picture[..., 3:]}
 
 
-def cloud_shader() -> ShaderConfig:
-    """Return the project's shader pack: positions to a micrometre, base colour, segmentation; compiles in 0.1 s.
+def set_cloud_formats() -> None:
+    """Set the formats of the cloud shader's pictures for the cameras that are built next.
 
-    The stock packs round positions down to millimetres and take seconds to compile their lighting. Call it right
-    before the cameras are built: picture formats are process-wide in SAPIEN, and ManiSkill's own packs set theirs.
+    Formats are process-wide in SAPIEN, and ManiSkill's own shader packs set theirs with each of their cameras.
     """
     sapien.render.set_picture_format(COLOR, "r8g8b8a8unorm")
     sapien.render.set_picture_format(CLOUD_POSITION, "r32g32b32a32sint")
+
+
+def cloud_shader() -> ShaderConfig:
+    """Return the project's shader pack: positions to a micrometre, base colour, segmentation; compiles in 0.1 s.
+
+    The stock packs round positions down to millimetres and take seconds to compile their lighting. Before a camera
+    with this shader is built, call `set_cloud_formats`.
+    """
     return ShaderConfig(
         shader_pack=str(asset("shaders", "cloud")),
         texture_names={COLOR: ["rgb"], CLOUD_POSITION: ["position", "depth", "segmentation"]},

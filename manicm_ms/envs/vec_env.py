@@ -15,6 +15,7 @@ import gymnasium
 import numpy as np
 import torch
 from gymnasium.vector import AsyncVectorEnv, AutoresetMode, VectorEnv
+from gymnasium.vector.async_vector_env import AsyncState
 from gymnasium.vector.utils import batch_space
 from numpy.typing import ArrayLike
 from torch import Tensor
@@ -27,6 +28,7 @@ from manicm_ms.types import AGENT_POS, POINT_CLOUD, ChunkSpec, EnvSpec
 
 BACKENDS = ("auto", "cpu", "gpu")
 _START_METHOD = "forkserver"  # fork hangs once a Vulkan or GL context exists in the parent
+_REAP_S = 0.2  # how long a worker's end may take to show after its pipe broke
 _DEAD_WORKER = (EOFError, BrokenPipeError, ConnectionResetError)
 
 Obs = dict[str, Tensor]
@@ -151,6 +153,7 @@ class CpuVecEnv(VecEnv):
         )
         self._info: dict[str, np.ndarray] = {}
         self._video = config.video
+        self._broken = False
 
     def reset(
         self, *, seed: int | Sequence[int] | None = None, options: dict[str, Any] | None = None
@@ -178,20 +181,30 @@ class CpuVecEnv(VecEnv):
 
     def close_extras(self, **kwargs: Any) -> None:
         """Stop the worker processes."""
-        alive = all(process.is_alive() for process in self._workers.processes)
-        self._workers.close(terminate=not alive)
+        broken = self._broken or not all(process.is_alive() for process in self._workers.processes)
+        if broken:
+            self._workers._state = AsyncState.DEFAULT  # else Gymnasium waits for an answer that never comes
+        self._workers.close(terminate=broken)
 
     def _guarded(self, call: Any, *args: Any, **kwargs: Any) -> Any:
         try:
             with _quiet_gymnasium():
                 return call(*args, **kwargs)
         except _DEAD_WORKER as error:
-            dead = [k for k, process in enumerate(self._workers.processes) if not process.is_alive()]
-            codes = [self._workers.processes[k].exitcode for k in dead]
+            self._broken = True
             raise BackendError(
-                f"worker process {dead} of {self.env_spec.env_id} died (exit code {codes}): close this environment and "
-                "make it anew; 'manicm-ms doctor' tells whether the machine can simulate and render"
+                f"{self._dead_workers()} of {self.env_spec.env_id} died: close this environment and make it anew; "
+                "'manicm-ms doctor' tells whether the machine can simulate and render"
             ) from error
+        except Exception:
+            self._broken = True  # a worker that raised has ended
+            raise
+
+    def _dead_workers(self) -> str:
+        for process in self._workers.processes:
+            process.join(_REAP_S)
+        codes = {k: process.exitcode for k, process in enumerate(self._workers.processes) if not process.is_alive()}
+        return f"worker processes {list(codes)} (exit codes {list(codes.values())})"
 
     def _tensors(self, obs: dict[str, np.ndarray]) -> Obs:
         return {key: torch.from_numpy(values.copy()) for key, values in obs.items()}  # the workers' memory is reused
