@@ -118,6 +118,21 @@ def train_teacher(data: Data, budget: Budget, seed: int) -> Network:
     return network.requires_grad_(False)
 
 
+def _pair(
+    solver: ConsistencySolver, networks: tuple[Network, Network, Network], c: Tensor, x_t: Tensor, index: Tensor
+) -> tuple[Tensor, Tensor]:
+    """Return `consistency_pair` of (teacher, online, target) under the conditions c."""
+    teacher, online, target = networks
+    return consistency_pair(
+        solver,
+        teacher=lambda x, t: teacher(x, t, c),
+        online=lambda x, t: consistency(online, x, t, c),
+        target=lambda x, t: consistency(target, x, t, c),
+        x_t=x_t,
+        index=index,
+    )
+
+
 def distil(teacher: Network, solver: ConsistencySolver, data: Data, budget: Budget, seed: int) -> Network:
     """Return the student that consistency distillation makes of `teacher` with one of the solvers."""
     generator = torch.Generator().manual_seed(seed)
@@ -129,14 +144,8 @@ def distil(teacher: Network, solver: ConsistencySolver, data: Data, budget: Budg
     for _ in range(budget.student):
         c, x0 = data(budget.batch, generator)
         index = torch.randint(len(solver), (budget.batch,), generator=generator)
-        prediction, wanted = consistency_pair(
-            solver,
-            teacher=lambda x, t, c=c: teacher(x, t, c),
-            online=lambda x, t, c=c: consistency(online, x, t, c),
-            target=lambda x, t, c=c: consistency(target, x, t, c),
-            x_t=_noisy(x0, solver.timesteps[index], abar, generator),
-            index=index,
-        )
+        x_t = _noisy(x0, solver.timesteps[index], abar, generator)
+        prediction, wanted = _pair(solver, (teacher, online, target), c, x_t, index)
         optimizer.zero_grad()
         (prediction - wanted).square().mean().backward()
         optimizer.step()
