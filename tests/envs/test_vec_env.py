@@ -176,7 +176,7 @@ def test_killed_worker_is_told_and_closing_still_works():
     victim, other = env._workers.processes
     os.kill(victim.pid, signal.SIGKILL)
     victim.join()
-    with pytest.raises(BackendError, match=r"worker process \[0\] .* died .*-9.*make it anew"):
+    with pytest.raises(BackendError, match=r"worker processes \[0\] \(exit codes \[-9\]\) .* died.*make it anew"):
         env.step(torch.zeros(2, 2))
     env.close()
     env.close()
