@@ -15,12 +15,22 @@ from typing import Any, Literal
 
 import tyro
 
-from manicm_ms.errors import ManicmError, UnknownNameError
+from manicm_ms.errors import ConfigError, ManicmError, UnknownNameError
 
 Backend = Literal["auto", "cpu", "gpu"]
 Command = Callable[..., int | None]
 PROGRAM = "manicm-ms"
 USER_ERROR, INTERRUPTED = 2, 130
+_CHECK_THE_PATH = "check the paths on the command line"
+_REMEDIES = {
+    errno.EACCES: "name a place that you may read and write, or change its permissions",
+    errno.EPERM: "name a place that you may read and write, or change its permissions",
+    errno.EROFS: "name a place on a file system that can be written to",
+    errno.ENOENT: "make the folder it lies in, or correct the path",
+    errno.ENOTDIR: "a part of the path is a file: correct the path",
+    errno.EISDIR: "this is a folder where a file is wanted: correct the path",
+    errno.EEXIST: "name another place, or move away what stands there",
+}
 
 
 def list_command(kind: tyro.conf.Positional[Literal["envs", "policies", "presets"]], tag: str | None = None) -> None:
@@ -34,6 +44,8 @@ def list_command(kind: tyro.conf.Positional[Literal["envs", "policies", "presets
 
     from manicm_ms.cli import listing
 
+    if tag is not None and kind != "envs":
+        raise ConfigError(f"--tag selects environments, {kind} have no tags: use 'list envs --tag {tag}' or drop --tag")
     tables = {"envs": lambda: listing.envs(tag), "policies": listing.policies, "presets": listing.presets}
     Console().print(tables[kind]())
 
@@ -79,7 +91,7 @@ def collect_command(
         style: style of the expert, its default one if not given.
         backend: where to simulate.
         colors: store rgb beside xyz.
-        extras: optional fields to store: img, depth.
+        extras: optional fields to store: image, depth, privileged_state.
     """
     from manicm_ms.demos.collect import collect
     from manicm_ms.envs.vec_env import default_num_envs
@@ -175,11 +187,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     except ManicmError as error:
         code = _complain(str(error))
     except OSError as error:
-        if error.errno not in (errno.ENOSPC, errno.EDQUOT):
-            raise
-        code = _complain(
-            f"no space left on the disk ({error.filename or 'output'}): free some and give the same command"
-        )
+        code = _complain(_explain(error))
     except KeyboardInterrupt:
         print("stopped; the same command goes on from here", file=sys.stderr)
         code = INTERRUPTED
@@ -213,6 +221,15 @@ def _overview() -> None:
     plain = {name: (command.__doc__ or "").splitlines()[0] for name, command in _PLAIN.items()}
     for name, summary in {**plain, **_WITH_PRESET}.items():
         print(f"  {name:<9} {summary}")
+
+
+def _explain(error: OSError) -> str:
+    """Say which file is in trouble, why and what to try; raise `error` again where it is about no file and no disk."""
+    if error.errno in (errno.ENOSPC, errno.EDQUOT):
+        return f"no space left on the disk ({error.filename or 'output'}): free some and give the same command"
+    if error.filename is None:
+        raise error
+    return f"{error.filename}: {error.strerror or error}: {_REMEDIES.get(error.errno or 0, _CHECK_THE_PATH)}"
 
 
 def _complain(message: str) -> int:

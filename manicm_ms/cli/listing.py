@@ -6,12 +6,20 @@ from dataclasses import fields
 
 from rich.table import Table
 
+from manicm_ms.errors import UnknownNameError
+
 
 def envs(tag: str | None = None) -> Table:
-    """Return the environments, those carrying `tag` if it is given: shapes, rate, length, expert styles, tags."""
+    """Return the environments, those carrying `tag` if it is given: shapes, rate, length, expert styles, tags.
+
+    Raises UnknownNameError where no environment carries `tag`.
+    """
     from manicm_ms.demos.experts import EXPERTS
     from manicm_ms.envs.simulator import ENVS
 
+    known_tags = {t for name in ENVS.names() for t in ENVS.tags(name)}
+    if tag is not None and tag not in known_tags:
+        raise UnknownNameError("tag", tag, known_tags)
     table = Table("env id", "cloud", "agent_pos", "action", "Hz", "steps", "frame", "expert", "tags")
     for column in table.columns[:2]:
         column.no_wrap = True
