@@ -33,6 +33,7 @@ NEEDED_MESA = (24, 3)  # lavapipe before 24.3 lacks what SAPIEN asks of a render
 BACKPORTS_FILE = "manicm-ms-backports.sources"
 ALIASES = ("stable", "oldstable", "testing")  # suites that a sources file may name in place of the code name
 SYSTEM_DRIVERS = (Path("/usr/share/vulkan/icd.d"), Path("/etc/vulkan/icd.d"), Path("/usr/local/share/vulkan/icd.d"))
+USERS_DRIVER = ("VK_DRIVER_FILES", "VK_ICD_FILENAMES")
 # Part of the C runtime: never loaded from a private folder, a process has them already.
 RUNTIME = ("libc.so", "libm.so", "libdl.so", "libpthread.so", "librt.so", "ld-linux", "libresolv", "libnsl", "libutil")
 
@@ -333,8 +334,12 @@ def write_manifest(folder: Path, driver: str, preload: list[str]) -> None:
 
 
 def device(python: str, source: str) -> str:
-    """Return the name of the device that SAPIEN renders with, "" for none; `source` is as MANICM_MS_VULKAN."""
-    env = {**os.environ, "MANICM_MS_VULKAN": source}
+    """Return the name of the device that SAPIEN renders with, "" for none; `source` is as MANICM_MS_VULKAN.
+
+    A driver that this shell names is left out: what renders here must render in a shell that names none.
+    """
+    env = {key: value for key, value in os.environ.items() if key not in USERS_DRIVER}
+    env["MANICM_MS_VULKAN"] = source
     try:
         done = subprocess.run(
             [python, "-m", "manicm_ms.vulkan"], capture_output=True, text=True, env=env, timeout=300, check=False
