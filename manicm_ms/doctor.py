@@ -19,7 +19,7 @@ from importlib import metadata
 from pathlib import Path
 from typing import Literal
 
-from manicm_ms import vulkan
+from manicm_ms import sapien_gpu, vulkan
 
 Status = Literal["ok", "warn", "fail"]
 
@@ -106,32 +106,27 @@ def check_cuda() -> Finding:
 def check_physx_gpu() -> Finding:
     """Look for the PhysX library that GPU simulation needs; SAPIEN fetches it at first use, this does not."""
     try:
-        folder = physx_gpu_folder()
+        library = physx_gpu_library()
     except ValueError as error:
         return Finding("PhysX GPU library", "fail", str(error), _REINSTALL)
-    libraries = sorted(folder.glob("libPhysXGpu*")) if folder.is_dir() else []
-    if libraries:
-        return Finding("PhysX GPU library", "ok", str(libraries[0]))
+    if library.is_file():
+        return Finding("PhysX GPU library", "ok", str(library))
     if not _nvidia_driver():
         return Finding("PhysX GPU library", "ok", "absent and not needed: there is no NVIDIA GPU")
-    return Finding(
-        "PhysX GPU library",
-        "warn",
-        f"absent from {folder}: GPU simulation needs it",
-        "run python -c 'import sapien; sapien.physx.enable_gpu()' once with network access, or copy that folder here",
-    )
+    found = f"not at {library}: GPU simulation needs it"
+    return Finding("PhysX GPU library", "warn", found, sapien_gpu.PHYSX_REMEDY)
 
 
-def physx_gpu_folder() -> Path:
-    """Return the folder where SAPIEN keeps the PhysX GPU library.
+def physx_gpu_library() -> Path:
+    """Return where SAPIEN looks for the PhysX GPU library, asked in a process of its own.
 
     Raises ValueError where SAPIEN does not import.
     """
-    asked = _python("from manicm_ms import vulkan; vulkan.prepare(); from sapien import physx; print(physx.version())")
+    asked = _python(f"import runpy; runpy.run_module({sapien_gpu.__name__!r}, run_name='__main__')")
     if asked.returncode:
         lines = asked.stderr.strip().splitlines() or [f"exit status {asked.returncode}"]
         raise ValueError(f"sapien does not import: {lines[-1]}")
-    return Path.home() / ".sapien" / "physx" / asked.stdout.strip().splitlines()[-1]
+    return Path(asked.stdout.strip().splitlines()[-1])
 
 
 def check_opencv() -> Finding:

@@ -12,7 +12,7 @@ import pytest
 REPO = Path(__file__).resolve().parents[1]
 FOLDERS = {"manicm_ms": REPO / "manicm_ms", "manicm_ms.tasks": REPO / "tasks", "manicm_ms.assets": REPO / "assets"}
 SIMULATORS = {"sapien", "mani_skill", "mujoco", "metaworld", "mplib"}
-BASE = {"types", "errors", "registry", "paths", "point_cloud", "provenance"}
+BASE = {"types", "errors", "registry", "paths", "point_cloud", "provenance", "devices", "seeds"}
 
 # layer -> the parts of manicm_ms that it may import beside itself and the base
 ALLOWED = {
@@ -20,17 +20,18 @@ ALLOWED = {
     "__init__": {"envs"},  # lazily: make_vec and check_vec_env
     "assets": set(),
     "vulkan": set(),
+    "sapien_gpu": {"vulkan"},
     "robots": {"vulkan"},
-    "envs": {"robots", "tasks", "vulkan"},
+    "envs": {"robots", "tasks", "vulkan", "sapien_gpu"},
     "tasks": {"envs", "robots", "demos", "vulkan"},
     "demos": {"envs", "tasks"},
     "policies": set(),
     "training": {"demos", "policies"},
     "evaluation": {"envs", "policies", "demos", "tasks"},
     "deploy": {"policies"},
-    "doctor": {"vulkan"},
+    "doctor": {"vulkan", "sapien_gpu"},
 }
-MAY_SIMULATE = {"robots", "envs", "tasks", "vulkan"}
+MAY_SIMULATE = {"robots", "envs", "tasks", "vulkan", "sapien_gpu"}
 UNBOUND = {"cli"}  # the command line: may import everything, nobody imports it
 
 

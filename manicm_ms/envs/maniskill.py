@@ -10,7 +10,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from manicm_ms import vulkan
+from manicm_ms import sapien_gpu, vulkan
 
 vulkan.prepare()  # before SAPIEN is first imported
 
@@ -142,13 +142,14 @@ def _make(gym_id: str, spec: EnvSpec, config: SimulatorConfig) -> UR3eTabletopEn
     height, width = config.image_size
     shader = cloud_shader()
     set_cloud_formats()
+    render_on_gpu = torch.cuda.is_available() and sapien_gpu.cuda_can_render()
     options: dict[str, Any] = {
         "num_envs": config.num_rows,
         "obs_mode": "none",  # frames are rendered on demand, by `observe`
         "reward_mode": config.reward_mode,
         "control_mode": spec.action.control_mode,
         "sim_backend": "physx_cpu" if config.device == "cpu" else "physx_cuda",
-        "render_backend": "sapien_cuda" if torch.cuda.is_available() else "sapien_cpu",
+        "render_backend": "sapien_cuda" if render_on_gpu else "sapien_cpu",
         "sensor_configs": {"shader_config": shader, "width": width, "height": height},
         # ManiSkill builds the video camera in any case: without video it shares the shader that is compiled already.
         "human_render_camera_configs": {"shader_pack": VIDEO_SHADER} if config.video else {"shader_config": shader},

@@ -18,6 +18,8 @@ from manicm_ms.errors import ConfigError
 from manicm_ms.registry import Registry
 from manicm_ms.types import AGENT_POS, OBS_KEYS, POINT_CLOUD, EnvSpec
 
+REWARD_MODES = ("sparse", "dense", "normalized_dense", "none")
+
 
 class StepResult(NamedTuple):
     """What one control step of n rows brought.
@@ -44,7 +46,7 @@ class SimulatorConfig:
         colors: append rgb in [0, 1] to the cloud's xyz.
         image_size: (H, W) of the camera, pixels.
         video: make `render_video_frames` available (building takes some seconds longer).
-        reward_mode: "sparse", "normalized_dense", "dense" or "none".
+        reward_mode: one of `REWARD_MODES`.
         device: "cpu", or the accelerator that simulates and renders.
     """
 
@@ -61,6 +63,8 @@ class SimulatorConfig:
         unknown = [key for key in self.obs if key not in OBS_KEYS]
         if unknown or not self.obs:
             raise ConfigError(f"unknown observation keys {unknown}: choose from {', '.join(OBS_KEYS)}")
+        if self.reward_mode not in REWARD_MODES:
+            raise ConfigError(f"unknown reward_mode {self.reward_mode!r}: choose from {', '.join(REWARD_MODES)}")
         if self.num_rows < 1 or self.num_points < 1 or min(self.image_size) < 1:
             raise ConfigError(f"num_envs, num_points and image_size must be at least 1, got {self}")
 

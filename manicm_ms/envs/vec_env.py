@@ -8,7 +8,6 @@ import os
 from abc import abstractmethod
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
-from pathlib import Path
 from typing import Any
 
 import gymnasium
@@ -20,6 +19,7 @@ from gymnasium.vector.utils import batch_space
 from numpy.typing import ArrayLike
 from torch import Tensor
 
+from manicm_ms import sapien_gpu
 from manicm_ms.envs.chunk import ActionChunk
 from manicm_ms.envs.simulator import ENVS, EnvEntry, SimulatorConfig
 from manicm_ms.envs.worker import RowEnv, action_space, observation_space
@@ -287,8 +287,8 @@ def make_vec(
     Args:
         env_id: for example "ur3e/slide-block"; `manicm-ms list envs` shows all.
         num_envs: N.
-        backend: "gpu" (one batch on an accelerator), "cpu" (worker processes), or "auto": gpu where CUDA and SAPIEN's
-            PhysX GPU library are there, else cpu; `VecEnv.backend` says which it became.
+        backend: "gpu" (one batch on an accelerator), "cpu" (worker processes), or "auto": gpu where CUDA, a GPU that
+            SAPIEN can render on and its PhysX GPU library are there, else cpu; `VecEnv.backend` says which it became.
         obs: observation keys; only what is asked is rendered.
         chunk: give it to exchange histories and action chunks, as policies do; None for frames and actions.
         num_points: points of a cloud.
@@ -334,12 +334,11 @@ def _gpu_obstacle() -> str | None:
     """Return why ManiSkill cannot simulate on a GPU here, or None where it can. Downloads nothing."""
     if not torch.cuda.is_available():
         return "torch finds no CUDA device"
-    folder = Path.home() / ".sapien" / "physx"
-    if not any(folder.glob("*/libPhysXGpu_64.so")):
-        return (
-            f"SAPIEN's PhysX GPU library is not in {folder}; SAPIEN fetches it at its first use: run "
-            "python -c 'import sapien; sapien.physx.enable_gpu()' once while online"
-        )
+    library = sapien_gpu.physx_gpu_library()
+    if not library.is_file():
+        return f"SAPIEN's PhysX GPU library is not at {library}; {sapien_gpu.PHYSX_REMEDY}"
+    if not sapien_gpu.cuda_can_render():
+        return "SAPIEN cannot render on the CUDA device: the graphics part of its driver is missing"
     return None
 
 

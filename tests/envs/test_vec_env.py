@@ -210,6 +210,7 @@ def test_unknown_id_suggests_the_nearest():
         {"image_size": (0, 84)},
         {"obs": ()},
         {"obs": ("pointcloud",)},
+        {"reward_mode": "denser"},
     ],
 )
 def test_impossible_options(options):
