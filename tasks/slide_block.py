@@ -21,6 +21,7 @@ from manicm_ms.envs.simulator import ENVS, EnvEntry
 from manicm_ms.envs.ur3e_tabletop import SPAWN_CLEARANCE, UR3eTabletopEnv, pose_error, ur3e_spec
 from manicm_ms.errors import UnknownNameError
 from manicm_ms.robots.limits import pose_in_frame
+from manicm_ms.robots.ur3e_ag95 import OPENING_MAX, TCP_STEP, TCP_TURN
 from manicm_ms.types import EnvSpec
 
 ENV_ID, GYM_ID = "ur3e/slide-block", "UR3eSlideBlock-v1"
@@ -150,7 +151,8 @@ class SlideBlockExpert:
         if self.style not in self.styles:
             raise UnknownNameError("expert style", self.style, self.styles)
         self._layout = spec.state_layout
-        self._follower = WaypointFollower(spec, num_envs, Motion(control_hz=spec.action.control_hz), device)
+        motion = Motion(TCP_STEP, TCP_TURN, OPENING_MAX, control_hz=spec.action.control_hz)
+        self._follower = WaypointFollower(spec, num_envs, motion, device)
 
     def reset(self, state: Tensor, seeds: Sequence[int], mask: Tensor) -> None:
         """Plan the episodes of the rows in `mask` (N,) from their first state (N, S) and seeds (N)."""

@@ -24,23 +24,23 @@ class Motion:
     """How the tool moves between way-points.
 
     Attributes:
+        metres_per_unit: translation per control step of an action entry of 1.
+        radians_per_unit: rotation per control step of an action entry of 1.
+        max_opening: gripper opening of an action entry of +1 (-1 is closed), m.
         acceleration: m/s^2.
         turn_speed: rad/s about the tool axis.
         target_tolerance: commanded target within this distance of the way-point, m ...
         tcp_tolerance: ... and the measured TCP within this one: the way-point is reached, m.
-        metres_per_unit: translation per control step of an action entry of 1.
-        radians_per_unit: rotation per control step of an action entry of 1.
-        max_opening: gripper opening of an action entry of +1 (-1 is closed), m.
         control_hz: control steps per second.
     """
 
+    metres_per_unit: float
+    radians_per_unit: float
+    max_opening: float
     acceleration: float = 0.6
     turn_speed: float = 1.2
     target_tolerance: float = 1e-3
     tcp_tolerance: float = 5e-3
-    metres_per_unit: float = 0.0125
-    radians_per_unit: float = 0.0625
-    max_opening: float = 0.0952
     control_hz: float = 20.0
 
 

@@ -7,7 +7,7 @@ from manicm_ms.demos.waypoints import Motion, WaypointFollower, Waypoints, stopp
 from manicm_ms.types import ActionSpec, EnvSpec, ObsSpec
 
 LAYOUT = {"tcp_pose": (0, 7), "tcp_target_pose": (7, 14)}
-MOTION = Motion()
+MOTION = Motion(metres_per_unit=0.02, radians_per_unit=0.08, max_opening=0.09)
 DT = 1 / MOTION.control_hz
 LAG = 0.4  # share of its distance to the target that the simulated arm makes good in a control step
 SPEC = EnvSpec(
