@@ -23,7 +23,7 @@ from manicm_ms import sapien_gpu
 from manicm_ms.envs.chunk import ActionChunk
 from manicm_ms.envs.simulator import ENVS, EnvEntry, SimulatorConfig
 from manicm_ms.envs.worker import RowEnv, action_space, observation_space
-from manicm_ms.errors import ActionError, BackendError, ConfigError
+from manicm_ms.errors import ActionError, BackendError, ConfigError, ManicmError
 from manicm_ms.types import AGENT_POS, POINT_CLOUD, ChunkSpec, EnvSpec
 
 BACKENDS = ("auto", "cpu", "gpu")
@@ -65,6 +65,7 @@ class VecEnv(VectorEnv[Obs, Tensor, Tensor]):
         self.single_action_space = action_space(spec, chunk.n_action_steps if chunk else None)
         self.observation_space = batch_space(self.single_observation_space, num_envs)
         self.action_space = batch_space(self.single_action_space, num_envs)
+        self._every_row_started = False
 
     @abstractmethod
     def reset(
@@ -74,10 +75,15 @@ class VecEnv(VectorEnv[Obs, Tensor, Tensor]):
 
         Args:
             seed: N seeds, one a row; or one, from which the rows count up; or None for random ones.
-            options: {"reset_mask": (N,) bool} resets only those rows and leaves the others as they are.
+            options: {"reset_mask": (N,) bool} resets only those rows and leaves the others as they are; the first
+                reset must cover every row.
 
         Returns:
             observations (N, ...) and info of all rows.
+
+        Raises:
+            ConfigError: a mask or seeds that do not fit.
+            BackendError: as `step`.
         """
 
     @abstractmethod
@@ -90,7 +96,7 @@ class VecEnv(VectorEnv[Obs, Tensor, Tensor]):
 
         Raises:
             ActionError: wrong shape, NaN or infinity. Entries out of range are clipped and counted.
-            BackendError: a worker process died; close the environment and make it anew.
+            BackendError: a worker process failed or died, now or earlier; close the environment and make it anew.
         """
 
     @abstractmethod
@@ -124,6 +130,8 @@ class VecEnv(VectorEnv[Obs, Tensor, Tensor]):
         mask = np.asarray(torch.as_tensor(mask).cpu())
         if mask.shape != (self.num_envs,) or mask.dtype != bool:
             raise ConfigError(f"reset_mask must be ({self.num_envs},) bool, got {mask.shape} {mask.dtype}")
+        if not self._every_row_started and not mask.all():
+            raise ConfigError("the first reset must cover every row: leave reset_mask out, or make it all True")
         return mask
 
     def _seeds(self, seed: int | Sequence[int] | None) -> list[int]:
@@ -153,17 +161,19 @@ class CpuVecEnv(VecEnv):
         )
         self._info: dict[str, np.ndarray] = {}
         self._video = config.video
-        self._broken = False
+        self._failure: str | None = None  # why no call can succeed any more
 
     def reset(
         self, *, seed: int | Sequence[int] | None = None, options: dict[str, Any] | None = None
     ) -> tuple[Obs, Info]:
         """See `VecEnv.reset`."""
         mask, seeds = self._reset_mask(options), self._seeds(seed)
+        self._require_sound()
         if mask.any():
             obs, info = self._guarded(self._workers.reset, seed=seeds, options={"reset_mask": mask})
         else:
             obs, info = self._workers.observations, {}
+        self._every_row_started = True
         return self._tensors(obs), self._merged(info, mask)
 
     def step(self, actions: ArrayLike | Tensor) -> tuple[Obs, Tensor, Tensor, Tensor, Info]:
@@ -181,24 +191,34 @@ class CpuVecEnv(VecEnv):
 
     def close_extras(self, **kwargs: Any) -> None:
         """Stop the worker processes."""
-        broken = self._broken or not all(process.is_alive() for process in self._workers.processes)
+        broken = self._failure is not None or not all(process.is_alive() for process in self._workers.processes)
         if broken:
             self._workers._state = AsyncState.DEFAULT  # else Gymnasium waits for an answer that never comes
         self._workers.close(terminate=broken)
 
     def _guarded(self, call: Any, *args: Any, **kwargs: Any) -> Any:
+        self._require_sound()
         try:
             with _quiet_gymnasium():
                 return call(*args, **kwargs)
         except _DEAD_WORKER as error:
-            self._broken = True
-            raise BackendError(
-                f"{self._dead_workers()} of {self.env_spec.env_id} died: close this environment and make it anew; "
-                "'manicm-ms doctor' tells whether the machine can simulate and render"
-            ) from error
-        except Exception:
-            self._broken = True  # a worker that raised has ended
-            raise
+            self._failure = f"{self._dead_workers()} of {self.env_spec.env_id} died"
+            raise self._backend_error() from error
+        except Exception as error:  # a worker that raised has ended
+            self._failure = f"a worker process of {self.env_spec.env_id} failed ({_last_line(error)})"
+            if isinstance(error, ManicmError):
+                raise
+            raise self._backend_error() from error
+
+    def _require_sound(self) -> None:
+        if self._failure is not None:
+            raise self._backend_error()
+
+    def _backend_error(self) -> BackendError:
+        return BackendError(
+            f"{self._failure}: close this environment and make it anew; "
+            "'manicm-ms doctor' tells whether the machine can simulate and render"
+        )
 
     def _dead_workers(self) -> str:
         for process in self._workers.processes:
@@ -244,6 +264,7 @@ class GpuVecEnv(VecEnv):
         if len(rows):
             where = torch.as_tensor(rows, device=self.device)
             self._history, _ = self._rows.reset(where, [seeds[k] for k in rows])
+            self._every_row_started = True
         return self._unchunk(self._history), self._with_errors(self._rows.info())
 
     def step(self, actions: ArrayLike | Tensor) -> tuple[Obs, Tensor, Tensor, Tensor, Info]:
@@ -351,6 +372,11 @@ def _quiet_gymnasium() -> Iterator[None]:
         yield
     finally:
         gymnasium.logger.min_level = level
+
+
+def _last_line(error: Exception) -> str:
+    lines = str(error).strip().splitlines()  # of a traceback, the last line says what happened
+    return lines[-1].strip() if lines else type(error).__name__
 
 
 def _require_video(video: bool) -> None:

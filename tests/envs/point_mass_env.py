@@ -3,6 +3,7 @@
 import torch
 
 from manicm_ms.envs.simulator import ENVS, EnvEntry, Simulator, SimulatorConfig, StepResult
+from manicm_ms.errors import RenderDeviceError
 from manicm_ms.types import AGENT_POS, DEPTH, IMAGE, POINT_CLOUD, STATE, ActionSpec, EnvSpec, ObsSpec
 
 MAX_STEPS = 12
@@ -97,6 +98,17 @@ class NotFinite(PointMass):
         return frame
 
 
+class Raises(PointMass):
+    """Cannot start the seed 13; the seed 14 meets an error that the package knows."""
+
+    def start(self, seed):
+        if seed == 13:
+            raise RuntimeError("a long story:\nno start for this seed")
+        if seed == 14:
+            raise RenderDeviceError("no device: install one")
+        return super().start(seed)
+
+
 class RemembersTheLastEpisode(PointMass):
     """Its first step after a reset goes on with the last action of the episode before."""
 
@@ -117,9 +129,13 @@ BROKEN = {
     "toy/remembers": (RemembersTheLastEpisode, "same seed same episode"),
 }
 """id -> (simulator, the promise it breaks)."""
-SOUND = "toy/point-mass-env"
+SOUND, RAISING = "toy/point-mass-env", "toy/raising"
 
-for env_id, simulator in {SOUND: PointMass, **{name: broken for name, (broken, _) in BROKEN.items()}}.items():
+for env_id, simulator in {
+    SOUND: PointMass,
+    RAISING: Raises,
+    **{name: broken for name, (broken, _) in BROKEN.items()},
+}.items():
     ENVS.add(env_id, EnvEntry(make_spec(env_id), simulator, __name__))
 
 

@@ -9,12 +9,12 @@ import numpy as np
 import point_mass_env
 import pytest
 import torch
-from point_mass_env import BROKEN, SOUND
+from point_mass_env import BROKEN, RAISING, SOUND
 
 from manicm_ms.envs.conformance import PROPERTIES, check_vec_env
 from manicm_ms.envs.simulator import ENVS, SimulatorConfig
 from manicm_ms.envs.vec_env import CpuVecEnv, GpuVecEnv, make_vec, resolve_backend
-from manicm_ms.errors import ActionError, BackendError, ConfigError, ManicmError, UnknownNameError
+from manicm_ms.errors import ActionError, BackendError, ConfigError, ManicmError, RenderDeviceError, UnknownNameError
 from manicm_ms.types import AGENT_POS, POINT_CLOUD, STATE, ChunkSpec
 
 OURS = [env_id for env_id in ENVS.names() if not env_id.startswith("toy/")]
@@ -144,6 +144,18 @@ def test_bad_resets(env):
             env.reset(seed=[1, 2], options={"reset_mask": mask})
 
 
+@pytest.mark.parametrize("mask", [[False, False], [True, False]])
+def test_first_reset_must_cover_every_row(mask):
+    entry, config = ENVS.get(SOUND), SimulatorConfig(num_rows=2)
+    on_gpu_code = GpuVecEnv(entry, config.specialise(entry.spec), 2, config, None)
+    for env in (make_vec(SOUND, 2, "cpu"), on_gpu_code):
+        with closing(env):
+            with pytest.raises(ConfigError, match="the first reset must cover every row"):
+                env.reset(seed=[1, 2], options={"reset_mask": np.array(mask)})
+            env.reset(seed=[1, 2])
+            env.reset(seed=[1, 2], options={"reset_mask": np.array(mask)})
+
+
 def test_video_must_be_asked_for(env):
     with pytest.raises(ConfigError, match="video=True"):
         env.render_video_frames()
@@ -184,6 +196,34 @@ def test_killed_worker_is_told_and_closing_still_works():
     while other.is_alive() and time.monotonic() < deadline:
         time.sleep(0.05)
     assert not other.is_alive()
+
+
+@pytest.mark.parametrize(
+    ("seed", "kind", "message"),
+    [
+        (13, BackendError, r"^a worker process of toy/raising failed \(no start for this seed\): .*make it anew"),
+        (14, RenderDeviceError, "^no device: install one$"),
+    ],
+)
+def test_an_error_in_a_worker_ends_the_environment(seed, kind, message):
+    env = make_vec(RAISING, 2, "cpu", obs=(AGENT_POS,), video=True)
+    env.reset(seed=[1, 2])
+    with pytest.raises(kind, match=message) as first:
+        env.reset(seed=[1, seed])
+    assert "\n" not in str(first.value)
+    if kind is BackendError:
+        assert isinstance(first.value.__cause__, RuntimeError)
+    nobody = {"reset_mask": np.zeros(2, dtype=bool)}
+    for call in (
+        lambda: env.step(torch.zeros(2, 2)),
+        lambda: env.reset(seed=[1, 2]),
+        lambda: env.reset(options=nobody),
+        env.render_video_frames,
+    ):
+        with pytest.raises(BackendError, match="toy/raising failed .*make it anew"):
+            call()
+    env.close()
+    env.close()
 
 
 def test_closing_ends_the_workers():
