@@ -25,7 +25,7 @@ class Property:
     Attributes:
         name: the promise, in a few words.
         passed: whether it holds.
-        detail: what was seen where it does not.
+        detail: what was seen where it does not, or why it was not looked at.
     """
 
     name: str
@@ -35,6 +35,10 @@ class Property:
 
 class ViolationError(Exception):
     """A promise that does not hold."""
+
+
+class NotPromisedError(Exception):
+    """A promise that the environment's backend does not make."""
 
 
 def _require(holds: bool | Tensor, otherwise: str) -> None:
@@ -64,6 +68,13 @@ class _Checks:
         frames += [env.step(action)[0] for action in self._actions(env)]
         return frames
 
+    def _promised(self, frames: list[Obs]) -> list[Obs]:
+        """Return those frames of an episode that its seed decides bit for bit.
+
+        All on a CPU; in the rows of a GPU batch, which share a scene, the first one (docs/decisions/0010).
+        """
+        return frames if self.env.backend == "cpu" else frames[:1]
+
     # ---- the properties ---------------------------------------------------------------------------------------
 
     def plays(self) -> None:
@@ -85,13 +96,15 @@ class _Checks:
                 _require(torch.isfinite(values.float()).all(), f"{key} holds NaN or infinity")
 
     def same_seed_same_episode(self) -> None:
-        _assert_equal(self._episode, self._play(self.env, _SEEDS), "a second run of the same seeds")
+        again = self._promised(self._play(self.env, _SEEDS))
+        _assert_equal(self._promised(self._episode), again, "a second run of the same seeds")
 
     def seed_decides_whatever_num_envs(self) -> None:
         alone = self._make(1, obs=_EVERY_KEY)
         try:
-            second = [{k: v[1:] for k, v in frame.items()} for frame in self._episode]
-            _assert_equal(second, self._play(alone, _SEEDS[1:]), "the second seed alone, in another process,")
+            second = [{k: v[1:] for k, v in frame.items()} for frame in self._promised(self._episode)]
+            played = self._promised(self._play(alone, _SEEDS[1:]))
+            _assert_equal(second, played, "the second seed alone, in another environment,")
         finally:
             alone.close()
 
@@ -120,6 +133,8 @@ class _Checks:
 
     def unreset_row_goes_on(self) -> None:
         """The row left alone by a partial reset continues as if nothing had happened."""
+        if self.env.backend != "cpu":
+            raise NotPromisedError("not looked at: rows of a gpu batch repeat their start, not their episode")
         actions = self._actions(self.env)
         self.env.reset(seed=list(_SEEDS))
         for k in range(3):
@@ -151,7 +166,8 @@ class _Checks:
         clipped, *_, info = self.env.step(big)
         self.env.reset(seed=list(_SEEDS))
         plain = self.env.step(limit)[0]
-        _assert_equal([plain], [clipped], "an action out of range")
+        if self.env.backend == "cpu":  # elsewhere one and the same step need not end alike to the last bit
+            _assert_equal([plain], [clipped], "an action out of range")
         _require(info["clipped"].tolist() == [1, 1], f"info['clipped'] is {info['clipped'].tolist()}, not [1, 1]")
 
     def info_complete(self) -> None:
@@ -173,6 +189,8 @@ class _Checks:
         for key, values in first.items():
             repeated = torch.stack([start[key], start[key]])
             _require(torch.equal(values[0], repeated), f"the first history of {key} is not the first frame repeated")
+        if self.env.backend != "cpu":
+            return
         for key, values in second.items():
             _require(torch.equal(values[0, 0], before[key]), f"history of {key}: not the frame before the last")
             _require(torch.equal(values[0, 1], last[key]), f"history of {key}: not the last frame")
@@ -226,9 +244,13 @@ def check_vec_env(
     """Check the promises of `VecEnv` on an environment id, by playing it.
 
     Checked are: it plays at all; spaces and dtypes; finite observations; the same seed gives the same episode, again,
-    alone and in another process; seeds differ; observations answer to actions and share no memory; a partial reset
+    alone and in another environment; seeds differ; observations answer to actions and share no memory; a partial reset
     leaves the other rows as they are; NaN and misshapen actions are refused, those out of range clipped and counted;
     info is complete; a chunk equals its single steps; the time limit truncates and freezes; closing twice is harmless.
+
+    On the cpu backend episodes are compared whole and bit for bit. On the gpu backend a seed promises the same start
+    (docs/decisions/0010): the properties about equal episodes then compare the first frame alone, and "unreset row
+    goes on" is passed with the reason in its detail.
 
     Args:
         env_id: a registered id.
@@ -258,6 +280,8 @@ def _run(check: Callable[[_Checks], None], checks: _Checks) -> Property:
     name = check.__name__.replace("_", " ")
     try:
         check(checks)
+    except NotPromisedError as reason:
+        return Property(name, True, str(reason))
     except (ViolationError, ManicmError) as error:
         return Property(name, False, str(error))
     except Exception as error:  # whatever an environment raises is its own failure, not this check's

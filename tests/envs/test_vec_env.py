@@ -41,6 +41,24 @@ def test_a_broken_environment_is_caught(env_id):
     assert failed[promise], "the detail says what was seen"
 
 
+def checked_as_on_a_gpu(env_id, monkeypatch):
+    """Results of the conformance check where every environment says that its backend is gpu."""
+    monkeypatch.setattr(CpuVecEnv, "backend", "gpu")
+    return {r.name: r for r in check_vec_env(env_id, "cpu")}
+
+
+def test_on_a_gpu_a_seed_promises_the_start_alone(monkeypatch):
+    results = checked_as_on_a_gpu("toy/remembers", monkeypatch)
+    assert [r.name for r in results.values() if not r.passed] == []
+    assert "gpu" in results["unreset row goes on"].detail
+
+
+def test_on_a_gpu_the_start_is_compared(monkeypatch):
+    results = checked_as_on_a_gpu("toy/global-random", monkeypatch)
+    assert not results["same seed same episode"].passed
+    assert "at frame 0" in results["same seed same episode"].detail
+
+
 def test_promises_have_names_of_their_own():
     names = [check.__name__ for check in PROPERTIES]
     assert len(set(names)) == len(names) >= 15
@@ -220,7 +238,7 @@ def test_an_error_in_a_worker_ends_the_environment(seed, kind, message):
         lambda: env.reset(options=nobody),
         env.render_video_frames,
     ):
-        with pytest.raises(BackendError, match="toy/raising failed .*make it anew"):
+        with pytest.raises(BackendError, match=r"toy/raising failed .*make it anew"):
             call()
     env.close()
     env.close()
