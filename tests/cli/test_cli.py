@@ -1,0 +1,229 @@
+"""`manicm-ms` as its users meet it: exit statuses, one-line errors, presets as options, and going on after Ctrl-C."""
+
+import os
+import re
+import signal
+import subprocess
+import sys
+import time
+
+import point_mass_env
+import pytest
+from reach_demos import make_store
+
+from manicm_ms import __version__
+from manicm_ms.cli import INTERRUPTED, USER_ERROR, _explain, main
+from manicm_ms.policies.checkpoint import read_manifest, verify_checkpoint
+from manicm_ms.training.log import read_log
+from manicm_ms.training.run_folder import training_folder
+
+COMMANDS = ("list", "check", "collect", "inspect", "evaluate", "doctor", "train", "distill")
+STEPS = 200
+TINY = f"--steps {STEPS} --warmup-steps 2 --batch-size 4 --down-dims 8 16 --points 8 --save-every 50 --log-every 1"
+
+
+def program(*arguments):
+    """Start `manicm-ms` in a process of its own, with room for help texts and no colours."""
+    command = [sys.executable, "-m", "manicm_ms.cli", *map(str, arguments)]
+    env = {**os.environ, "COLUMNS": "200", "NO_COLOR": "1", "OMP_NUM_THREADS": "1"}
+    return subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, env=env)
+
+
+def outcome(process):
+    """Wait for a process; return its exit status, output and errors."""
+    out, err = process.communicate(timeout=300)
+    return process.returncode, out, err
+
+
+@pytest.fixture
+def told(capsys):
+    """Run a command in this process; return its exit status, output and errors."""
+
+    def run(*arguments):
+        with pytest.raises(SystemExit) as end:
+            main([str(word) for word in arguments])
+        return end.value.code, *capsys.readouterr()
+
+    return run
+
+
+@pytest.fixture(scope="module")
+def demos(tmp_path_factory):
+    return make_store(tmp_path_factory.mktemp("demos") / "reach.zarr", episodes=3)
+
+
+def assert_one_line(result, *parts):
+    """The command ended as a user error with one line that holds every part."""
+    status, _, err = result
+    assert status == USER_ERROR
+    assert err.startswith("manicm-ms: ")
+    assert err.count("\n") == 1, err
+    for part in parts:
+        assert part in err
+
+
+# ---- overview, help, version
+
+
+def test_without_a_command_it_shows_all_of_them_and_fails():
+    status, out, _ = outcome(program())
+    assert status == USER_ERROR
+    assert [line.split()[0] for line in out.splitlines()[2:]] == list(COMMANDS)
+
+
+def test_help_shows_the_same_and_succeeds(told):
+    assert told("--help")[:2] == (0, told()[1])
+
+
+def test_version():
+    assert outcome(program("--version")) == (0, f"{__version__}\n", "")
+
+
+@pytest.mark.parametrize("command", COMMANDS)
+def test_every_command_has_help(told, command):
+    status, out, _ = told(command, "--help")
+    assert status == 0
+    assert f"usage: manicm-ms {command}" in out
+
+
+def test_the_named_preset_gives_the_defaults(told):
+    def default(option, *arguments):
+        words = " ".join(re.sub("[│╭╮╰╯─]", " ", told("train", *arguments, "--help")[1]).split())
+        return re.search(rf"--{option} \S+ .*?\(default: (.*?)\)", words)[1]
+
+    assert default("n-action-steps") == default("n-action-steps", "--preset", "quick") == "3"
+    assert default("n-action-steps", "--preset=paper") == default("n-action-steps", "--preset", "paper") == "2"
+    assert default("learning-rate", "--preset=paper") == "0.0001"
+
+
+# ---- lists
+
+
+def test_list_envs_and_their_tags():
+    status, out, _ = outcome(program("list", "envs", "--tag", "ur3e"))
+    assert status == 0
+    assert re.search(r"ur3e/slide-block .*512x3", out)
+
+
+@pytest.mark.parametrize(("kind", "names"), [("policies", ("dp3", "simple_dp3", "manicm")), ("presets", ("paper",))])
+def test_list(told, kind, names):
+    status, out, _ = told("list", kind)
+    assert status == 0
+    assert all(name in out for name in names)
+
+
+def test_list_refuses_an_unknown_tag(told):
+    assert_one_line(told("list", "envs", "--tag", "ur3"), "unknown tag 'ur3'", "did you mean 'ur3e'?", "real-robot")
+
+
+@pytest.mark.parametrize("kind", ["policies", "presets"])
+def test_list_refuses_a_tag_of_what_has_none(told, kind):
+    assert_one_line(told("list", kind, "--tag", "ur3e"), "--tag", kind)
+
+
+# ---- what a user can get wrong
+
+
+def test_unknown_command_in_a_real_process():
+    assert_one_line(outcome(program("colect")), "unknown command 'colect': did you mean 'collect'?")
+
+
+@pytest.mark.parametrize(
+    ("line", "hint"),
+    [
+        ("train dp3 --data DATA --out OUT --preset quik", "unknown teacher preset 'quik': did you mean 'quick'?"),
+        ("distill --teacher T --data DATA --out OUT --preset=papr", "'papr': did you mean 'paper'?"),
+        ("train dp33 --data DATA --out OUT", "unknown teacher policy 'dp33': did you mean 'dp3'?"),
+        ("collect ur3e/slide-blok --out OUT", "'ur3e/slide-blok': did you mean 'ur3e/slide-block'?"),
+        ("check ur3e/slide-blok", "'ur3e/slide-blok': did you mean 'ur3e/slide-block'?"),
+        ("collect ur3e/slide-block --out OUT --extras img", "choose from image, depth, privileged_state"),
+        (
+            "train dp3 --data DATA --out OUT --n-action-steps 4",
+            "n_action_steps=4 exceeds horizon - n_obs_steps + 1 = 3",
+        ),
+        ("train dp3 --data DATA --out OUT --steps 20", "warmup_steps=100 leaves nothing of steps=20"),
+        ("check", "name at least one environment id"),
+        ("evaluate --env ur3e/slide-block", "name at least one checkpoint folder"),
+    ],
+)
+def test_one_line_says_what_is_wrong(told, demos, tmp_path, line, hint):
+    places = {"DATA": demos, "OUT": tmp_path / "out", "T": tmp_path / "teacher"}
+    assert_one_line(told(*(places.get(word, word) for word in line.split())), hint)
+    assert not (tmp_path / "out").exists()
+
+
+def test_unknown_style_of_an_expert():
+    arguments = ("collect", "ur3e/slide-block", "--out", os.devnull + "/x.zarr", "--style", "one-side", "--num-envs", 1)
+    assert_one_line(outcome(program(*arguments)), "unknown expert style 'one-side': did you mean 'one-sided'?")
+
+
+def test_an_option_of_no_command_is_refused(told):
+    status, _, err = told("inspect", "x.zarr", "--htlm", "page.html")
+    assert status == USER_ERROR
+    assert "--htlm" in err
+    assert "Traceback" not in err
+
+
+# ---- files
+
+
+def test_a_folder_that_cannot_be_made_is_one_line(told, demos, tmp_path):
+    (tmp_path / "file").touch()
+    result = told("train", "dp3", "--data", demos, "--out", tmp_path / "file" / "teacher", *TINY.split())
+    assert_one_line(result, str(tmp_path / "file"))
+
+
+def test_a_file_in_a_folder_that_takes_none_is_one_line(demos):
+    assert_one_line(outcome(program("inspect", demos, "--html", "/proc/page.html")), "/proc/", "No such file", "path")
+
+
+@pytest.mark.skipif(os.geteuid() == 0, reason="nothing is forbidden to root")
+def test_a_folder_without_write_permission_is_one_line(told, demos, tmp_path):
+    tmp_path.chmod(0o500)
+    assert_one_line(told("inspect", demos, "--html", tmp_path / "page.html"), "Permission denied", "permissions")
+
+
+def test_an_error_about_no_file_is_not_hidden():
+    with pytest.raises(ConnectionError, match="a defect"):
+        _explain(ConnectionError("a defect"))
+
+
+# ---- work
+
+
+def test_check_passes_a_sound_environment(told):
+    status, out, _ = told("check", point_mass_env.SOUND, "--backend", "cpu")
+    assert status == 0
+    assert out.count("  ok  ") > 5
+    assert "FAIL" not in out
+
+
+def test_check_fails_a_broken_environment_and_names_the_promise(told):
+    env_id, (_, promise) = "toy/ignores-seed", point_mass_env.BROKEN["toy/ignores-seed"]
+    status, out, _ = told("check", env_id, "--backend", "cpu")
+    assert status == 1
+    assert f"FAIL {promise}" in out
+
+
+def test_ctrl_c_ends_with_130_and_the_same_command_goes_on(told, demos, tmp_path):
+    teacher = tmp_path / "teacher"
+    command = ("train", "simple_dp3", "--data", demos, "--out", teacher, "--device", "cpu", *TINY.split())
+    log = training_folder(teacher) / "log.jsonl"
+    process = program(*command)
+    while process.poll() is None and not read_log(log):
+        time.sleep(0.01)
+    process.send_signal(signal.SIGINT)
+    status, _, err = outcome(process)
+    assert status == INTERRUPTED, err
+    assert err.endswith("stopped; the same command goes on from here\n")
+    assert "Traceback" not in err
+    reached = len(read_log(log))
+    assert 0 < reached < STEPS
+    assert not teacher.exists()
+
+    status, _, err = outcome(program(*command))
+    assert status == 0, err
+    verify_checkpoint(teacher)
+    assert [line["step"] for line in read_log(log)] == list(range(1, STEPS + 1))
+    assert read_manifest(teacher)["provenance"]["command"].startswith("manicm-ms train simple_dp3 --data ")
+    assert f"{teacher} is finished: nothing to do" in told(*command)[2]
