@@ -2,14 +2,18 @@
 
 import configparser
 import json
+import os
 import shutil
 import subprocess
 import sys
+import sysconfig
 import tarfile
 import zipfile
 from pathlib import Path
 
 import pytest
+
+from manicm_ms import __version__
 
 REPO = Path(__file__).resolve().parents[1]
 MAPPED = {"manicm_ms": "manicm_ms", "tasks": "manicm_ms/tasks", "assets": "manicm_ms/assets"}
@@ -51,37 +55,32 @@ def built(source, tmp_path_factory) -> Path:
 
 @pytest.fixture(scope="module")
 def installed(built, tmp_path_factory) -> Path:
-    """A folder into which the wheel, and nothing else, is installed."""
-    target = tmp_path_factory.mktemp("site")
-    wheel = next(built.glob("*.whl"))
-    command = [
-        sys.executable,
-        "-m",
-        "pip",
-        "install",
-        "-q",
-        "--no-index",
-        "--no-deps",
-        "--target",
-        str(target),
-        str(wheel),
-    ]
-    subprocess.run(command, check=True, capture_output=True)
-    return target
+    """A fresh environment with the wheel, which finds its dependencies (and nothing of this checkout) in this one's."""
+    environment = tmp_path_factory.mktemp("installed") / "venv"
+    subprocess.run([sys.executable, "-m", "venv", "--without-pip", str(environment)], check=True, capture_output=True)
+    python = environment / "bin" / "python"
+    install = [sys.executable, "-m", "pip", "--python", str(python), "install", "-q", "--no-index", "--no-deps"]
+    subprocess.run([*install, str(next(built.glob("*.whl")))], check=True, capture_output=True)
+    # A .pth file adds folders without running the .pth files in them, so the editable install there stays unseen.
+    ours = {sysconfig.get_path("purelib"), sysconfig.get_path("platlib")}
+    site = sysconfig.get_path("purelib", "venv", {"base": str(environment), "platbase": str(environment)})
+    (Path(site) / "dependencies.pth").write_text("".join(f"{folder}\n" for folder in sorted(ours)))
+    return environment
+
+
+def run_installed(program: Path, *arguments: str) -> str:
+    """Run a program of the fresh environment away from the checkout, without this shell's paths; return its output."""
+    env = {key: value for key, value in os.environ.items() if not key.startswith("PYTHON")}
+    done = subprocess.run(
+        [str(program), *arguments], capture_output=True, text=True, check=False, cwd=program.parent, env=env
+    )
+    assert done.returncode == 0, done.stderr[-3000:]
+    return done.stdout
 
 
 def ask_installed(installed: Path, code: str) -> dict:
-    """Run `code` where only the installed copy is importable (its dependencies are taken from here); parse its JSON."""
-    # -I ignores the environment and the working folder; the editable install's finder is taken out of sys.meta_path.
-    dependencies = [p for p in sys.path if "site-packages" in p]
-    start = (
-        "import sys, json\n"
-        "sys.meta_path = [f for f in sys.meta_path if '__editable__' not in getattr(f, '__module__', repr(f))]\n"
-        f"sys.path = [{str(installed)!r}] + [p for p in sys.path if p not in {dependencies!r}] + {dependencies!r}\n"
-    )
-    done = subprocess.run([sys.executable, "-I", "-c", start + code], capture_output=True, text=True, check=False)
-    assert done.returncode == 0, done.stderr[-3000:]
-    return json.loads(done.stdout.splitlines()[-1])
+    """Run `code` with the fresh environment's interpreter and parse the JSON that it prints last."""
+    return json.loads(run_installed(installed / "bin" / "python", "-c", "import json\n" + code).splitlines()[-1])
 
 
 def test_the_wheel_holds_every_file_of_the_tree(source, built):
@@ -169,7 +168,9 @@ def test_no_package_host_is_named():
         assert "://" not in (REPO / name).read_text(), name
 
 
-def test_the_command_line_is_installed(built):
-    with zipfile.ZipFile(next(built.glob("*.whl"))) as wheel:
-        name = next(n for n in wheel.namelist() if n.endswith("entry_points.txt"))
-        assert "manicm-ms = manicm_ms.cli:main" in wheel.read(name).decode()
+def test_the_installed_command_line_runs(installed):
+    home = Path(ask_installed(installed, "import manicm_ms\nprint(json.dumps(manicm_ms.__file__))"))
+    assert home.is_relative_to(installed)
+    manicm_ms = installed / "bin" / "manicm-ms"
+    assert run_installed(manicm_ms, "--version") == f"{__version__}\n"
+    assert "ur3e/slide-block" in run_installed(manicm_ms, "list", "envs")
