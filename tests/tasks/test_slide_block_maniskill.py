@@ -17,6 +17,7 @@ from mani_skill.vector.wrappers.gymnasium import ManiSkillVectorEnv  # isort: sk
 from manicm_ms.tasks.slide_block import ENV_ID, GYM_ID, MAX_EPISODE_STEPS, SPEC
 
 from manicm_ms.demos.experts import EXPERTS
+from manicm_ms.robots.ur3e_ag95 import JOINT_SPEED
 
 SMALL = {"sensor_configs": {"width": 32, "height": 32}}
 
@@ -33,11 +34,11 @@ def env():
     env.close()
 
 
-def expert_episode(env, seed, on_step=lambda *_: None):
+def expert_episode(env, seed, on_step=lambda *_: None, style=None):
     """Drive `env` with the expert until it ends; return its last step."""
     env.reset(seed=seed)
     base = env.unwrapped
-    expert = EXPERTS.get(ENV_ID)(SPEC, 1, torch.device("cpu"), None)
+    expert = EXPERTS.get(ENV_ID)(SPEC, 1, torch.device("cpu"), style)
     expert.reset(base.privileged_state(), [seed], torch.ones(1, dtype=torch.bool))
     for _ in range(MAX_EPISODE_STEPS):
         last = env.step(expert.act(base.privileged_state()))
@@ -130,6 +131,23 @@ def test_reward_grows_along_an_expert_episode(env, seed):
     assert rewards[-1] == 1
     thirds = [np.mean(part) for part in np.array_split(rewards, 3)]
     assert thirds == sorted(thirds)
+
+
+@pytest.mark.parametrize("seed", range(100, 105))
+@pytest.mark.parametrize("style", ["one-sided", "two-sided"])
+def test_expert_succeeds_within_the_joint_speed_limits(env, style, seed):
+    start, stop = SPEC.state_layout["arm_qvel"]
+    speeds = []
+
+    def note(*_):
+        speeds.append(env.unwrapped.privileged_state()[0, start:stop].abs())
+
+    *_, truncated, info = expert_episode(env, seed, note, style)
+    assert info["success"].item()
+    assert not truncated.item()
+    fastest = torch.stack(speeds).amax(dim=0)
+    assert (fastest <= torch.tensor(JOINT_SPEED)).all(), fastest
+    assert fastest.max() > 0.1, "the arm moves"
 
 
 @pytest.mark.parametrize("kind", ["no-op", "random"])

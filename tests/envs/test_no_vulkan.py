@@ -1,0 +1,51 @@
+"""Without a Vulkan device: one line that says so and what to do, from the library and from the command line."""
+
+import os
+import subprocess
+import sys
+
+MAKE = """
+from manicm_ms.envs.vec_env import make_vec
+from manicm_ms.errors import RenderDeviceError
+
+if __name__ == "__main__":
+    env = make_vec("ur3e/slide-block", backend="cpu")
+    try:
+        env.reset(seed=[0])
+    except RenderDeviceError as error:
+        print(error)
+    finally:
+        env.close()
+"""
+
+
+def without_vulkan(tmp_path, *words):
+    """Run Python where the Vulkan loader finds no driver."""
+    drivers = dict.fromkeys(("VK_DRIVER_FILES", "VK_ICD_FILENAMES"), str(tmp_path / "missing.json"))
+    env = os.environ | drivers | {"MANICM_MS_VULKAN": "system", "OMP_NUM_THREADS": "1"}
+    return subprocess.run([sys.executable, *map(str, words)], env=env, capture_output=True, text=True, check=False)
+
+
+def require_the_remedy(line):
+    assert "no Vulkan device" in line
+    assert "make setup" in line
+    assert "manicm-ms doctor" in line
+
+
+def test_reset_raises_a_render_device_error(tmp_path):
+    script = tmp_path / "make.py"
+    script.write_text(MAKE)
+    done = without_vulkan(tmp_path, script)
+    assert done.returncode == 0, done.stderr
+    (line,) = done.stdout.strip().splitlines()
+    require_the_remedy(line)
+
+
+def test_collect_ends_with_status_2_and_one_line(tmp_path):
+    out = tmp_path / "demos.zarr"
+    collect = ("collect", "ur3e/slide-block", "--episodes", 1, "--backend", "cpu", "--out", out)
+    done = without_vulkan(tmp_path, "-m", "manicm_ms.cli", *collect)
+    assert done.returncode == 2, done.stderr
+    assert "Traceback" not in done.stdout + done.stderr
+    (line,) = [line for line in done.stderr.splitlines() if "Vulkan" in line and "SAPIEN" in line]
+    require_the_remedy(line)
