@@ -24,6 +24,7 @@ from manicm_ms.envs.vec_env import VecEnv, make_vec
 from manicm_ms.errors import ConfigError, ManicmError, StoreError
 from manicm_ms.paths import require_free_space
 from manicm_ms.provenance import package_versions
+from manicm_ms.seeds import require_seed
 from manicm_ms.types import ACTION, AGENT_POS, DEPTH, IMAGE, POINT_CLOUD, STATE, EnvSpec
 
 _OBS_OF_FIELD = {
@@ -88,12 +89,22 @@ class Collector:
         self._rows: list[_Row | None] = [None] * env.num_envs
         self._seeds = [0] * env.num_envs
         self._next_seed = 0
+        self._begun: int | None = None  # first seed of a `begin` that no attempts followed yet
+
+    def begin(self, first_seed: int) -> None:
+        """Reset all rows to first_seed, first_seed + 1, ..., which shows whether the simulator runs at all.
+
+        `attempts` from the same seed goes on from here, and does this itself where it was not done.
+        """
+        self._next_seed = self._begun = first_seed
+        self._start(np.ones(self.env.num_envs, bool))
 
     def attempts(self, first_seed: int, wanted: int) -> Iterator[Attempt]:
         """Yield the attempts at first_seed, first_seed + 1, ... in this order, until `wanted` are solved."""
         done: dict[int, Attempt] = {}
-        self._next_seed, turn = first_seed, first_seed
-        self._start(np.ones(self.env.num_envs, bool))
+        if self._begun != first_seed:
+            self.begin(first_seed)
+        self._begun, turn = None, first_seed
         while wanted > 0:
             for attempt in self._step():
                 done[attempt.seed] = attempt
@@ -222,6 +233,7 @@ def collect(
     out, extras = Path(out), tuple(extras)
     if episodes < 1 or num_envs < 1:
         raise ConfigError(f"episodes and num_envs must be at least 1, got {episodes} and {num_envs}")
+    require_seed(seed)
     if unknown := set(extras) - set(OPTIONAL_FIELDS):
         raise ConfigError(f"extras {sorted(unknown)} are not known: choose from {', '.join(OPTIONAL_FIELDS)}")
     factory = EXPERTS.get(env_id)
@@ -244,12 +256,14 @@ def collect(
         expert = factory(env.env_spec, num_envs, env.device, style)
         asked |= {"expert": expert.name, "style": expert.style, "backend": env.backend}
         command = _command(asked, episodes, extras, colors)
+        collector = Collector(env, expert, tail_steps=tail_steps, extras=extras)
         if store is None:
+            collector.begin(seed)  # a simulator that does not run leaves no empty store behind
             provenance = asked | {"command": command, "versions": package_versions()}
             store = stack.enter_context(_create(out, env.env_spec, provenance, episodes))
         _require_same_origin(store, asked, env.env_spec)
         with _progress_bar(env_id, episodes, len(store)) as report:
-            added = fill(store, Collector(env, expert, tail_steps=tail_steps, extras=extras), episodes, seed, report)
+            added = fill(store, collector, episodes, seed, report)
         store.note(command=command)
         return Collected(out, len(store), store.attempts, added)
 

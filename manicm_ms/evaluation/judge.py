@@ -14,8 +14,9 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 
-from manicm_ms.errors import ConfigError, ManicmError
-from manicm_ms.evaluation.latency import Latency, measure_latency, torch_threads
+from manicm_ms.devices import resolve_device, torch_threads
+from manicm_ms.errors import ConfigError
+from manicm_ms.evaluation.latency import Latency, measure_latency
 from manicm_ms.evaluation.machine import machine
 from manicm_ms.evaluation.records import EpisodeLog, claimed_folder
 from manicm_ms.evaluation.report import crash_lines, paired_sentences, summary_table, write_report
@@ -24,6 +25,7 @@ from manicm_ms.evaluation.statistics import compare_paired, success_rate
 from manicm_ms.evaluation.video import Take, choose_seeds, film
 from manicm_ms.paths import sha256, write_json
 from manicm_ms.provenance import package_versions
+from manicm_ms.seeds import require_seed
 from manicm_ms.types import AGENT_POS, ChunkSpec, EnvSpec, require_compatible
 
 if TYPE_CHECKING:
@@ -74,6 +76,7 @@ class Protocol:
     def __post_init__(self) -> None:
         if not self.seeds:
             raise ConfigError("an evaluation needs at least one episode")
+        require_seed(min(self.seeds))
         if min(self.num_envs, self.threads, self.repetitions) < 1 or self.videos < 0:
             raise ConfigError(f"num_envs, threads and repetitions must be at least 1 and videos at least 0, got {self}")
 
@@ -120,7 +123,7 @@ def evaluate(
         out: folder of records and report.
         num_envs: rows in parallel; None takes the machine's cores.
         backend: of `make_vec`.
-        device: torch device of the policies.
+        device: of the policies: "auto", "cpu", "cuda", "cuda:1".
         control: add the teacher run in one step, without distillation, between teacher and student.
         videos: seeds filmed for teacher and student.
         threads: torch threads while policies act and latency is measured.
@@ -138,6 +141,7 @@ def evaluate(
     from manicm_ms.envs.simulator import ENVS
     from manicm_ms.envs.vec_env import default_num_envs, make_vec, resolve_backend
 
+    device = str(resolve_device(device))
     if episodes < 1:
         raise ConfigError(f"--episodes must be at least 1, got {episodes}")
     rows = min(num_envs or default_num_envs(), episodes)
@@ -235,14 +239,20 @@ def judge(
         episodes, spec = _play(contenders, protocol, envs, out, console)
         results = compile_results(contenders, protocol, episodes, latencies, command)
         results["success_rule"] = spec.success_rule
+        results["videos"] = []
+        _write(results, out)  # before filming, which may fail or be stopped
         results["videos"] = _film(contenders, protocol, envs, out, episodes, spec, console)
-        write_json(out / "results.json", results)
-        write_report(results, out)
+        _write(results, out)
     console.print(summary_table(results))
     for sentence in (*paired_sentences(results), *crash_lines(results)):
         console.print(sentence, highlight=False, markup=False)
     console.print(f"report: {out / 'report.html'}", soft_wrap=True)
     return results
+
+
+def _write(results: Mapping[str, Any], out: Path) -> None:
+    write_json(out / "results.json", results)
+    write_report(results, out)
 
 
 def compile_results(
@@ -428,8 +438,9 @@ def _film(
                         take.path.unlink()
             finally:
                 vec_env.close()
-    except ManicmError as error:  # a report without pictures is better than none
-        console.print(f"[yellow]no videos: {error}[/]")
+    except Exception as error:  # a report without pictures is better than none, whatever the renderer raised
+        reason = " ".join(f"{type(error).__name__}: {error}".split())
+        console.print(f"not all videos were made: {reason}", style="yellow", markup=False, soft_wrap=True)
     return [entry for entry in entries if (out / str(entry["file"])).exists()]
 
 

@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Iterator, Mapping
-from contextlib import contextmanager
+from collections.abc import Mapping
 from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 import torch
 
+from manicm_ms.devices import torch_threads
 from manicm_ms.errors import ConfigError
 from manicm_ms.types import AGENT_POS, POINT_CLOUD, ChunkSpec, EnvSpec
 
@@ -90,17 +90,6 @@ def measure_latency(
                 if repetition >= warmup:
                     times[name].append(elapsed)
     return {name: _summary(policies[name], times[name], threads) for name in policies}
-
-
-@contextmanager
-def torch_threads(count: int) -> Iterator[None]:
-    """Set torch's intra-op threads to `count` within the block and restore the former number after it."""
-    before = torch.get_num_threads()
-    torch.set_num_threads(count)
-    try:
-        yield
-    finally:
-        torch.set_num_threads(before)
 
 
 def _time_decision(policy: Policy, obs: Mapping[str, torch.Tensor], seed: int) -> float:

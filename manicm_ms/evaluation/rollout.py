@@ -127,9 +127,9 @@ def rollout(
     2. The policy decides for all N rows at once, idle ones included, so that the batch keeps one size.
        Row i's noise is a function of its episode's seed and the number of the decision alone.
     3. The env plays the chunk in all rows. Rows that ended give their result; back to 1.
-    4. A row whose simulation or policy fails (error in the env, an action that is not finite) is a failed
-       episode with its reason. If the env itself dies (BackendError), all episodes in flight are failed
-       ones; a `RestartableEnv` is restarted and the remaining seeds go on, any other env ends the
+    4. A row whose simulation or policy fails (error in the env, also at its reset, or an action that is not
+       finite) is a failed episode with its reason. If the env itself dies (BackendError), all episodes in
+       flight are failed ones; a `RestartableEnv` is restarted and the remaining seeds go on, any other env ends the
        roll-out with that error.
 
     Noise and initial state depend on the seed alone, hence the same seed meets two policies, or two
@@ -227,7 +227,10 @@ class _Rollout:
         mask = fresh if self.obs is not None else np.ones_like(fresh)
         spare = next(e.seed for e in self.rows if e is not None)
         seeds = [spare if e is None else e.seed for e in self.rows]
-        self.obs, _ = self.env.reset(seed=seeds, options={"reset_mask": mask})
+        self.obs, info = self.env.reset(seed=seeds, options={"reset_mask": mask})
+        for i in np.flatnonzero(fresh):
+            if (error := info["error"][i]) is not None:
+                self._end(int(i), False, error)
 
     def _decide(self) -> torch.Tensor:
         """Return actions (N, Ta, Da); end the episodes of rows whose action is not finite."""

@@ -1,4 +1,4 @@
-"""Where and in which precision to train: `auto` becomes what the machine does well."""
+"""In which precision to train, and with how many processes: `auto` becomes what the machine does well."""
 
 from __future__ import annotations
 
@@ -11,26 +11,6 @@ from manicm_ms.errors import ConfigError
 
 PRECISIONS = ("auto", "32-true", "bf16-mixed", "16-mixed")
 """32-true: all in float32. bf16-mixed, 16-mixed: products in 16 bits, weights and averages in float32."""
-
-
-def resolve_device(asked: str) -> torch.device:
-    """Return the device that `asked` ("auto", "cpu", "cuda", "cuda:1") names; auto prefers CUDA.
-
-    Raises ConfigError where the machine has no such device.
-    """
-    if asked == "auto":
-        return torch.device("cuda", 0) if torch.cuda.is_available() else torch.device("cpu")
-    try:
-        device = torch.device(asked)
-    except RuntimeError:
-        raise ConfigError(f"unknown device {asked!r}: use auto, cpu, cuda or cuda:N") from None
-    if device.type not in ("cpu", "cuda"):
-        raise ConfigError(f"device {asked!r} is not supported: use auto, cpu, cuda or cuda:N")
-    if device.type == "cuda":
-        device = torch.device("cuda", device.index or 0)
-        if not torch.cuda.is_available() or device.index >= torch.cuda.device_count():
-            raise ConfigError(f"device {asked!r}: {torch.cuda.device_count()} CUDA devices found; use --device cpu")
-    return device
 
 
 def resolve_precision(asked: str, device: torch.device) -> str:

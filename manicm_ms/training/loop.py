@@ -5,8 +5,7 @@ from __future__ import annotations
 import math
 import time
 from abc import ABC, abstractmethod
-from collections.abc import Iterator, Mapping
-from contextlib import contextmanager
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any, ClassVar, Protocol
 
@@ -15,6 +14,7 @@ from lightning_fabric import Fabric
 from rich.console import Console
 from torch import Tensor, nn
 
+from manicm_ms.devices import torch_threads
 from manicm_ms.errors import CheckpointError, TrainingDivergedError
 from manicm_ms.paths import require_free_space
 from manicm_ms.training.interrupt import stop_requests
@@ -208,18 +208,8 @@ def fit(
     """
     if fabric.device.type == "cpu":
         keep_freed_memory()
-    with _threads(config.threads):
+    with torch_threads(config.threads):
         return _fit(objective, data, config, run, fabric, seed, console, title)
-
-
-@contextmanager
-def _threads(count: int) -> Iterator[None]:
-    before = torch.get_num_threads()
-    torch.set_num_threads(count)
-    try:
-        yield
-    finally:
-        torch.set_num_threads(before)
 
 
 def _fit(

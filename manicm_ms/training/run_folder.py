@@ -35,7 +35,11 @@ _FULL_DISK = (errno.ENOSPC, errno.EDQUOT)
 
 
 def fingerprint(identity: Mapping[str, Any]) -> str:
-    """Return a short hash of `identity` (JSON values); equal identities train to equal weights."""
+    """Return a short hash of `identity` (JSON values).
+
+    Equal identities train to equal weights on one kind of device with one number of processes; neither of the two
+    is part of it, so that a run may go on elsewhere.
+    """
     return hashlib.sha256(json.dumps(identity, sort_keys=True).encode()).hexdigest()[:16]
 
 

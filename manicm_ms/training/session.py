@@ -18,9 +18,10 @@ from rich.console import Console
 from manicm_ms.demos.stats import FieldStats, store_stats
 from manicm_ms.demos.store import DemoStore
 from manicm_ms.demos.windows import Windows
+from manicm_ms.devices import resolve_device
 from manicm_ms.errors import CheckpointError, OutputExistsError
 from manicm_ms.policies.checkpoint import read_manifest, save_checkpoint
-from manicm_ms.training.device import make_fabric, resolve_device, resolve_precision
+from manicm_ms.training.device import make_fabric, resolve_precision
 from manicm_ms.training.loop import Batches, FitResult, fit
 from manicm_ms.training.objectives import PolicyObjective
 from manicm_ms.training.optim import FitConfig
@@ -143,6 +144,8 @@ class Session:
             done = _is_done(run)
             self.fabric.barrier()  # all ranks have looked before rank 0 writes
             if done:
+                if self.fabric.is_global_zero:
+                    run.drop_state()  # a kill between the checkpoint and this left it
                 self._say(f"{self.out} is finished: nothing to do")
                 return self.out
             objective, data = build()

@@ -6,10 +6,12 @@ from pathlib import Path
 
 from rich.console import Console
 
+from manicm_ms.devices import torch_threads
 from manicm_ms.errors import CheckpointError, ConfigError
 from manicm_ms.policies.checkpoint import load_checkpoint, read_manifest
 from manicm_ms.policies.diffusion import DiffusionPolicy
 from manicm_ms.policies.manicm import ManiCM
+from manicm_ms.seeds import require_seed
 from manicm_ms.training.features import encode_windows
 from manicm_ms.training.loop import Batches
 from manicm_ms.training.objectives import DISTILLATIONS, PolicyObjective
@@ -55,6 +57,7 @@ def distill(
         SpecMismatchError: data and teacher were made for different observations or actions.
         ManicmError: unfit configuration, damaged store, another run in `out`, full disk, NaN loss.
     """
+    require_seed(seed)
     teacher, objective_type = Path(teacher), DISTILLATIONS.get(preset.objective)
     policy = load_checkpoint(teacher)
     if not isinstance(policy, DiffusionPolicy):
@@ -77,7 +80,8 @@ def distill(
 
     def build() -> tuple[PolicyObjective, Batches]:
         network = policy.network.to(session.fabric.device)
-        features = encode_windows(network, demos.windows.to(session.fabric.device), preset.draws, seed)
+        with torch_threads(preset.threads):
+            features = encode_windows(network, demos.windows.to(session.fabric.device), preset.draws, seed)
         return objective_type(policy, student, preset.mu), features
 
     weights = manifest["files"]["model.safetensors"]["sha256"]

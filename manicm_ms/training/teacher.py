@@ -11,6 +11,7 @@ from rich.console import Console
 from manicm_ms.errors import UnknownNameError
 from manicm_ms.policies.base import POLICIES, make_policy
 from manicm_ms.policies.diffusion import DiffusionPolicy
+from manicm_ms.seeds import require_seed
 from manicm_ms.training.loop import Batches
 from manicm_ms.training.objectives import DiffusionObjective, PolicyObjective
 from manicm_ms.training.optim import PowerDecay
@@ -51,6 +52,7 @@ def train_teacher(
     Raises:
         ManicmError: unknown name, unfit configuration, damaged store, another run in `out`, full disk, NaN loss.
     """
+    require_seed(seed)
     teachers = POLICIES.names("teacher")
     if policy_name not in teachers:
         raise UnknownNameError("teacher policy", policy_name, teachers)

@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from toy_point_mass import ENV_ID, MAX_STEPS, unsolvable
+from toy_point_mass import ENV_ID, FIRST_BROKEN_SEED, MAX_STEPS, unsolvable
 
 from manicm_ms.demos.collect import Collector, collect, fill
 from manicm_ms.demos.experts import EXPERTS
@@ -113,6 +113,8 @@ def test_bad_input(tmp_path):
         collect(ENV_ID, 0, tmp_path / "a.zarr")
     with pytest.raises(ConfigError, match="sound"):
         collect(ENV_ID, 1, tmp_path / "a.zarr", extras=("sound",))
+    with pytest.raises(ConfigError, match="seed must not be negative"):
+        collect(ENV_ID, 1, tmp_path / "new" / "a.zarr", seed=-1)
     (tmp_path / "notes.txt").write_text("not a store")
     with pytest.raises(StoreError, match="not a store"):
         collect(ENV_ID, 1, tmp_path)
@@ -201,6 +203,12 @@ def test_kill_9_loses_and_doubles_nothing(reference, tmp_path):
     output = process.communicate()[0].decode()
     assert process.returncode == 0, output
     assert content(out) == content(reference)
+
+
+def test_a_simulator_that_does_not_run_leaves_no_store(tmp_path):
+    with pytest.raises(Exception, match="no device to render with"):
+        collect(ENV_ID, 1, tmp_path / "demos.zarr", num_envs=2, seed=FIRST_BROKEN_SEED)
+    assert not any(tmp_path.iterdir())
 
 
 def test_second_writer_is_refused_at_once(tmp_path):

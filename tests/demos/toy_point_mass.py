@@ -13,6 +13,7 @@ from manicm_ms.types import AGENT_POS, POINT_CLOUD, STATE, ActionSpec, EnvSpec, 
 
 ENV_ID = "toy/point-mass"
 MAX_STEPS = 40
+FIRST_BROKEN_SEED = 900_000  # the simulator fails at its reset
 SPEC = EnvSpec(
     env_id=ENV_ID,
     obs=ObsSpec(512, 3, 2, "world"),
@@ -34,6 +35,8 @@ class PointMass(Simulator):
         self.shape = torch.zeros(self.num_rows, spec.obs.num_points, spec.obs.point_channels)
 
     def reset(self, rows, seeds):
+        if max(seeds) >= FIRST_BROKEN_SEED:
+            raise RuntimeError("no device to render with")
         for row, seed in zip(rows.tolist(), seeds, strict=True):
             rng = np.random.default_rng(seed)
             self.position[row] = torch.tensor(rng.uniform(-1, 1, 2), dtype=torch.float32)

@@ -74,6 +74,10 @@ def test_bad_input_is_refused_before_anything_is_written(pair, tmp_path):
         run([tmp_path / "nowhere"], out)
     with pytest.raises(ConfigError, match="--episodes"):
         run(pair, out, episodes=0)
+    with pytest.raises(ConfigError, match="unknown device 'foo'"):
+        run(pair, out, device="foo")
+    with pytest.raises(ConfigError, match="CUDA devices found"):
+        run(pair, out, device="cuda:99")
     with pytest.raises(ConfigError, match="at least one checkpoint"):
         run([], out)
     with pytest.raises(ConfigError, match="one name"):

@@ -27,7 +27,7 @@ def contenders():
     ]
 
 
-def run(out, *, request=None, crash_at=None, made=None, videos=2, seeds=SEEDS):
+def run(out, *, request=None, crash_at=None, made=None, videos=2, seeds=SEEDS, film_env=PointMass):
     def for_policy(policy, n):
         env = PointMass(n, policy.chunk, crash_at=crash_at)
         if made is not None:
@@ -35,7 +35,7 @@ def run(out, *, request=None, crash_at=None, made=None, videos=2, seeds=SEEDS):
         return env
 
     protocol = Protocol(SPEC.env_id, seeds, num_envs=4, repetitions=3, videos=videos)
-    envs = EnvMaker(for_policy, lambda n: PointMass(n, chunk=None))
+    envs = EnvMaker(for_policy, lambda n: film_env(n, chunk=None))
     console = Console(file=io.StringIO(), width=160)
     results = judge(contenders(), protocol, envs, out, request or {"seed": 100}, COMMAND, console)
     return results, console.file.getvalue()
@@ -159,6 +159,31 @@ def test_another_evaluation_does_not_touch_the_folder(report):
     assert {p: p.read_bytes() for p in out.rglob("*") if p.is_file()} == before
 
 
+class Blind(PointMass):
+    """Has lost its renderer."""
+
+    failure: type[BaseException] = RuntimeError
+
+    def render_video_frames(self):
+        raise self.failure("vk::DeviceLost [device 0]")
+
+
+def test_a_renderer_that_fails_costs_the_videos_alone(tmp_path):
+    results, printed = run(tmp_path / "report", seeds=SEEDS[:4], film_env=Blind)
+    assert "RuntimeError: vk::DeviceLost [device 0]" in printed
+    assert results["videos"] == []
+    assert json.loads((tmp_path / "report" / "results.json").read_text()) == json.loads(json.dumps(results))
+
+
+def test_ctrl_c_while_filming_leaves_results_and_report(tmp_path, monkeypatch):
+    monkeypatch.setattr(Blind, "failure", KeyboardInterrupt)
+    with pytest.raises(KeyboardInterrupt):
+        run(tmp_path / "report", seeds=SEEDS[:4], film_env=Blind)
+    stored = json.loads((tmp_path / "report" / "results.json").read_text())
+    assert [p["n"] for p in stored["policies"]] == [4, 4, 4]
+    assert (tmp_path / "report" / "report.html").exists()
+
+
 def test_a_policy_alone_is_judged_without_a_pair(tmp_path):
     protocol = Protocol(SPEC.env_id, SEEDS[:4], num_envs=2, repetitions=1, videos=0)
     envs = EnvMaker(lambda policy, n: PointMass(n, policy.chunk), lambda n: PointMass(n, chunk=None))
@@ -180,3 +205,5 @@ def test_a_senseless_protocol_is_refused():
         Protocol(SPEC.env_id, (), num_envs=1)
     with pytest.raises(ConfigError, match="num_envs"):
         Protocol(SPEC.env_id, (1,), num_envs=0)
+    with pytest.raises(ConfigError, match="seed must not be negative, got -3"):
+        Protocol(SPEC.env_id, (-3, -2), num_envs=1)

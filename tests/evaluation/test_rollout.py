@@ -9,8 +9,8 @@ import pytest
 import torch
 from point_mass import CHUNK, DT, REACH, SPEC, PointMass, Proportional
 
+from manicm_ms.devices import torch_threads
 from manicm_ms.errors import BackendError, ConfigError, SpecMismatchError
-from manicm_ms.evaluation.latency import torch_threads
 from manicm_ms.evaluation.rollout import MAX_RESTARTS, EpisodeResult, RestartableEnv, decision_noise, rollout
 from manicm_ms.policies.base import make_policy
 from manicm_ms.policies.manicm import ManiCM
@@ -111,6 +111,28 @@ def test_a_crashed_row_is_a_failure_with_its_reason_and_disturbs_no_other():
         else:
             assert after == before
     assert len(crashed) == len(SEEDS)
+
+
+class FailsToReset(PointMass):
+    """Cannot set up the scenes of some seeds."""
+
+    def reset(self, *, seed=None, options=None):
+        obs, _ = super().reset(seed=seed, options=options)
+        for i in np.flatnonzero(options["reset_mask"]):
+            if self.seeds[i] in (100, 101, 102, 107):
+                self.error[i], self.finished[i] = "no room for the block", True
+        return obs, self._info()
+
+
+@pytest.mark.parametrize("num_envs", [1, 3])
+def test_a_row_that_fails_at_its_reset_is_a_failure_without_a_decision(num_envs):
+    clean = rollout(PointMass(num_envs), Proportional(), SEEDS)
+    results = rollout(FailsToReset(num_envs), Proportional(), SEEDS)
+    for before, after in zip(clean, results, strict=True):
+        if after.seed in (100, 101, 102, 107):
+            assert (after.success, after.decisions, after.crashed) == (False, 0, "no room for the block")
+        else:
+            assert after == before
 
 
 def test_an_action_that_is_not_finite_fails_its_episode_alone():

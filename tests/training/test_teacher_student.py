@@ -158,6 +158,21 @@ def test_bad_input_is_named(pair, tmp_path, policy, data, error, match):
     assert not any(tmp_path.iterdir())
 
 
+def test_a_negative_seed_is_refused_before_anything_is_made(pair, tmp_path):
+    for train, *inputs, preset in ((train_teacher, "simple_dp3", pair[1], TEACHER), (distill, *pair[2:0:-1], STUDENT)):
+        with pytest.raises(ConfigError, match="seed must not be negative, got -1"):
+            run(train, *inputs, tmp_path / "out", preset, seed=-1)
+    assert not any(tmp_path.iterdir())
+
+
+def test_a_state_left_by_a_kill_after_the_checkpoint_is_removed(pair):
+    folder, data, teacher, _ = pair
+    state = folder / "teacher.train" / "state.safetensors"
+    state.write_bytes(b"left behind")
+    assert "finished" in run(train_teacher, "simple_dp3", data, teacher, TEACHER)[1]
+    assert not state.exists()
+
+
 def test_skip_must_divide_the_timesteps(pair, tmp_path):
     with pytest.raises(ConfigError, match="skip=7 must divide"):
         run(distill, pair[2], pair[1], tmp_path / "out", replace(STUDENT, skip=7))
