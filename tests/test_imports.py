@@ -27,7 +27,7 @@ ALLOWED = {
     "demos": {"envs", "tasks"},
     "policies": set(),
     "training": {"demos", "policies"},
-    "evaluation": {"envs", "policies", "demos", "tasks"},
+    "evaluation": {"envs", "policies"},
     "deploy": {"policies"},
     "doctor": {"vulkan", "sapien_gpu"},
 }

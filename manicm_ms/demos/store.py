@@ -24,11 +24,8 @@ when the store is next opened for appending.
 from __future__ import annotations
 
 import errno
-import fcntl
 import json
 import os
-import shutil
-import tempfile
 from collections.abc import Iterable, Mapping
 from contextlib import suppress
 from dataclasses import dataclass
@@ -41,7 +38,7 @@ import numpy as np
 import zarr
 
 from manicm_ms.errors import ManicmError, NoSpaceError, OutputExistsError, StoreError
-from manicm_ms.paths import require_free_space, write_json
+from manicm_ms.paths import is_disk_full, require_free_space, sync, take_lock, temporary_folder, write_json
 from manicm_ms.types import EnvSpec
 
 FORMAT = "manicm_ms demos 1"
@@ -64,7 +61,6 @@ EPISODE_ARRAYS = {"seed": np.dtype("<i8"), "success": np.dtype("bool"), "length"
 _CHUNK_FRAMES = 100  # about an episode; DP3's stores have the same
 _CHUNK_EPISODES = 1024
 _SPARE_BYTES = 32 << 20  # kept free beside what an append needs, so that the commit itself finds room
-_FULL_DISK = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
 _LOCK = ".lock"
 
 
@@ -144,18 +140,14 @@ class DemoStore:
         if unknown := set(extras) - set(OPTIONAL_FIELDS):
             raise StoreError(f"a store has no optional field {sorted(unknown)}: choose from {OPTIONAL_FIELDS}")
         require_free_space(path, _SPARE_BYTES)
-        path.parent.mkdir(parents=True, exist_ok=True)
-        fresh = Path(tempfile.mkdtemp(dir=path.parent, prefix=f".{path.name}."))
-        try:
+        with temporary_folder(path) as fresh:
             _write_empty(fresh, spec, dict(provenance), extras)
-            fresh.chmod(0o755)
-            os.rename(fresh, path)  # refuses to replace anything but an empty folder
-        except OSError as e:
-            if e.errno in (errno.ENOTEMPTY, errno.EEXIST, errno.ENOTDIR):
-                raise OutputExistsError(f"{path} exists: open it to append, or choose another path") from e
-            raise
-        finally:
-            shutil.rmtree(fresh, ignore_errors=True)
+            try:
+                os.rename(fresh, path)  # refuses to replace anything but an empty folder
+            except OSError as e:
+                if e.errno in (errno.ENOTEMPTY, errno.EEXIST, errno.ENOTDIR):
+                    raise OutputExistsError(f"{path} exists: open it to append, or choose another path") from e
+                raise
         return cls.open(path, "a")
 
     @classmethod
@@ -287,7 +279,7 @@ class DemoStore:
             self._commit(self.num_frames + len(episode))
             self._dirty = False
         except OSError as e:
-            if e.errno not in _FULL_DISK:
+            if not is_disk_full(e):
                 raise
             with suppress(OSError):  # else the next append or open does it
                 self._cut()
@@ -360,7 +352,7 @@ class DemoStore:
         _write_bytes(chunk_file, chunk.tobytes())
         header["shape"] = [number + 1]
         write_json(folder / ".zarray", header)
-        _sync(folder)
+        sync(folder)
 
     def _cut(self) -> None:
         """Remove what was written past the last commit, by an append that did not come to its end."""
@@ -469,16 +461,8 @@ def _sync_rows(folder: Path, array: zarr.Array, start: int) -> None:
     numbers = range(start // array.chunks[0], -(-array.shape[0] // array.chunks[0]))
     for name in (".zarray", *(f"{n}{zeros}" for n in numbers)):
         if (folder / name).exists():  # zarr writes no file for a chunk of zeros
-            _sync(folder / name)
-    _sync(folder)
-
-
-def _sync(path: Path) -> None:
-    handle = os.open(path, os.O_RDONLY)
-    try:
-        os.fsync(handle)
-    finally:
-        os.close(handle)
+            sync(folder / name)
+    sync(folder)
 
 
 def _write_bytes(path: Path, content: bytes) -> None:
@@ -492,26 +476,15 @@ def _write_bytes(path: Path, content: bytes) -> None:
 
 
 def _take_lock(path: Path) -> int:
-    """Become the one writer of the store; raise StoreError naming the process that already is.
+    """Become the one writer of the store; raise StoreError naming the process that already is."""
 
-    The lock is the kernel's (flock), so it goes with its holder and is never stale; the pid in the
-    file only serves the message.
-    """
+    def refuse(holder: str) -> StoreError:
+        return StoreError(f"{path} is being written by process {holder}: wait for it to end or stop it, then try again")
+
     try:
-        handle = os.open(path / _LOCK, os.O_RDWR | os.O_CREAT, 0o644)
+        return take_lock(path / _LOCK, refuse)
     except OSError as e:
         raise StoreError(f"cannot write to {path} ({e.strerror}): check its permissions") from e
-    try:
-        fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
-    except BlockingIOError as e:
-        holder = os.pread(handle, 32, 0).decode(errors="replace").strip() or "unknown"
-        os.close(handle)
-        raise StoreError(
-            f"{path} is being written by process {holder}: wait for it to end or stop it, then try again"
-        ) from e
-    os.ftruncate(handle, 0)
-    os.pwrite(handle, f"{os.getpid()}\n".encode(), 0)
-    return handle
 
 
 def _release(lock: int | None) -> None:

@@ -15,7 +15,7 @@ from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 
 from manicm_ms.devices import resolve_device, torch_threads
-from manicm_ms.errors import ConfigError
+from manicm_ms.errors import ConfigError, OutputExistsError
 from manicm_ms.evaluation.latency import Latency, measure_latency
 from manicm_ms.evaluation.machine import machine
 from manicm_ms.evaluation.records import EpisodeLog, claimed_folder
@@ -322,7 +322,7 @@ def _latencies(contenders: Sequence[Contender], protocol: Protocol, path: Path) 
     Before any worker process exists, so that the machine is quiet.
     """
     if path.exists():
-        stored = {name: Latency(**fields) for name, fields in json.loads(path.read_text(encoding="utf-8")).items()}
+        stored = _stored_latencies(path)
         wanted = (protocol.threads, protocol.repetitions)
         if set(stored) == {c.name for c in contenders} and all((s.threads, s.n) == wanted for s in stored.values()):
             return stored
@@ -331,6 +331,14 @@ def _latencies(contenders: Sequence[Contender], protocol: Protocol, path: Path) 
     )
     write_json(path, {name: latency._asdict() for name, latency in measured.items()})
     return measured
+
+
+def _stored_latencies(path: Path) -> dict[str, Latency]:
+    try:
+        stored = json.loads(path.read_text(encoding="utf-8"))
+        return {name: Latency(**fields) for name, fields in stored.items()}
+    except (ValueError, TypeError, AttributeError) as error:
+        raise OutputExistsError(f"{path} is damaged: delete it and latency is measured again") from error
 
 
 def _play(

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import fcntl
 import json
 import os
 from collections.abc import Iterator, Mapping
@@ -12,7 +11,7 @@ from typing import Any
 
 from manicm_ms.errors import OutputExistsError
 from manicm_ms.evaluation.rollout import EpisodeResult
-from manicm_ms.paths import require_free_space, write_json
+from manicm_ms.paths import exclusive_lock, require_free_space, write_json
 
 RUN_FILE = "run.json"
 """What the folder holds: the request whose records lie in it."""
@@ -36,13 +35,11 @@ def claimed_folder(out: Path, request: Mapping[str, Any]) -> Iterator[Path]:
     _require_same(out, request)
     require_free_space(out, _NEED_BYTES)
     out.mkdir(parents=True, exist_ok=True)
-    with (out / _LOCK_FILE).open("w") as lock:
-        try:
-            fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)  # the kernel lifts it when the process ends, however
-        except BlockingIOError:
-            raise OutputExistsError(
-                f"{out} is being written by another process: wait for it or choose another --out"
-            ) from None
+
+    def refuse(holder: str) -> OutputExistsError:
+        return OutputExistsError(f"{out} is being written by process {holder}: wait for it or choose another --out")
+
+    with exclusive_lock(out / _LOCK_FILE, refuse):
         _require_same(out, request)
         write_json(out / RUN_FILE, dict(request))
         yield out
@@ -88,6 +85,8 @@ class EpisodeLog:
 
     Args:
         path: the JSON Lines file; made where it does not exist.
+
+    Raises OutputExistsError where another line is damaged, which no kill does; the file is left as it is.
     """
 
     def __init__(self, path: Path) -> None:
@@ -96,11 +95,20 @@ class EpisodeLog:
         self._results: dict[int, EpisodeResult] = {}
         text = path.read_bytes() if path.exists() else b""
         whole = text[: text.rfind(b"\n") + 1]
-        for line in whole.splitlines():
-            result = EpisodeResult.from_record(json.loads(line))
+        for number, line in enumerate(whole.splitlines(), start=1):
+            result = self._parsed(line, number)
             self._results[result.seed] = result
         self._file = path.open("ab")
         self._file.truncate(len(whole))
+
+    def _parsed(self, line: bytes, number: int) -> EpisodeResult:
+        try:
+            return EpisodeResult.from_record(json.loads(line))
+        except (ValueError, KeyError, TypeError) as error:
+            raise OutputExistsError(
+                f"line {number} of {self.path} is damaged: delete this line and its episode is played again, "
+                "or choose another --out"
+            ) from error
 
     def __getitem__(self, seed: int) -> EpisodeResult:
         return self._results[seed]

@@ -228,9 +228,9 @@ class _Rollout:
         spare = next(e.seed for e in self.rows if e is not None)
         seeds = [spare if e is None else e.seed for e in self.rows]
         self.obs, info = self.env.reset(seed=seeds, options={"reset_mask": mask})
-        for i in np.flatnonzero(fresh):
+        for i in np.flatnonzero(fresh).tolist():
             if (error := info["error"][i]) is not None:
-                self._end(int(i), False, error)
+                self._end(i, False, error)
 
     def _decide(self) -> torch.Tensor:
         """Return actions (N, Ta, Da); end the episodes of rows whose action is not finite."""

@@ -13,7 +13,6 @@ Nothing is ever unpickled.
 
 from __future__ import annotations
 
-import errno
 import json
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
@@ -27,7 +26,7 @@ from safetensors.torch import load_file, save_file
 from torch import Tensor
 
 from manicm_ms.errors import CheckpointError, ConfigError, ManicmError, NoSpaceError, OutputExistsError
-from manicm_ms.paths import replaced_folder, require_free_space, sha256, write_json, write_text
+from manicm_ms.paths import is_disk_full, replaced_folder, require_free_space, set_aside, sha256, write_json, write_text
 from manicm_ms.policies.base import POLICIES, Policy
 from manicm_ms.policies.model_card import model_card
 from manicm_ms.provenance import package_versions
@@ -94,7 +93,7 @@ def read_manifest(folder: Path) -> dict[str, Any]:
     folder = Path(folder)
     path = folder / _MANIFEST
     if not folder.is_dir():
-        old = folder.with_name(folder.name + ".old")
+        old = set_aside(folder)
         if old.is_dir():
             raise CheckpointError(
                 f"saving {folder} was cut off and left the checkpoint before it: rename {old} to {folder}"
@@ -225,8 +224,7 @@ def _disk_errors(folder: Path) -> Iterator[None]:
     try:
         yield
     except (OSError, SafetensorError) as error:
-        full = getattr(error, "errno", None) in (errno.ENOSPC, errno.EDQUOT) or "No space left" in str(error)
-        if not full:
+        if not is_disk_full(error):
             raise
         raise NoSpaceError(
             f"no space left for the checkpoint {folder}; nothing was changed: free some space and save again"

@@ -13,8 +13,6 @@
 
 from __future__ import annotations
 
-import errno
-import fcntl
 import hashlib
 import json
 import os
@@ -29,9 +27,7 @@ from safetensors.torch import save_file
 from torch import Tensor
 
 from manicm_ms.errors import CheckpointError, NoSpaceError, OutputExistsError
-from manicm_ms.paths import write_json
-
-_FULL_DISK = (errno.ENOSPC, errno.EDQUOT)
+from manicm_ms.paths import exclusive_lock, is_disk_full, write_json
 
 
 def fingerprint(identity: Mapping[str, Any]) -> str:
@@ -116,7 +112,7 @@ class RunFolder:
             os.replace(fresh, self._state)
         except (OSError, SafetensorError) as e:
             fresh.unlink(missing_ok=True)
-            if getattr(e, "errno", None) in _FULL_DISK or "No space left" in str(e):
+            if is_disk_full(e):
                 raise NoSpaceError(
                     f"no space left for the training state in {self.folder}; the one saved before is whole: "
                     "free some space and run the same command again"
@@ -152,13 +148,11 @@ def open_run(out: Path, identity: Mapping[str, Any]) -> Iterator[RunFolder]:
     """
     run = RunFolder(out, identity)
     run.folder.mkdir(parents=True, exist_ok=True)
-    with (run.folder / "lock").open("w") as lock:
-        try:
-            fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)  # the system lets go of it however the process ends
-        except BlockingIOError:
-            raise OutputExistsError(
-                f"{out} is being trained by another process: wait for it, or choose another --out"
-            ) from None
+
+    def refuse(holder: str) -> OutputExistsError:
+        return OutputExistsError(f"{out} is being trained by process {holder}: wait for it, or choose another --out")
+
+    with exclusive_lock(run.folder / "lock", refuse):
         run.claim()
         yield run
 

@@ -159,6 +159,15 @@ def test_another_evaluation_does_not_touch_the_folder(report):
     assert {p: p.read_bytes() for p in out.rglob("*") if p.is_file()} == before
 
 
+@pytest.mark.parametrize("content", ["{", "[]", '{"teacher": 3}', '{"teacher": {"median_ms": 1}}'])
+def test_a_damaged_file_of_latencies_is_named_with_the_remedy(tmp_path, content):
+    out = tmp_path / "report"
+    run(out, seeds=SEEDS[:2], videos=0)
+    (out / "latency.json").write_text(content)
+    with pytest.raises(OutputExistsError, match=r"latency\.json is damaged: delete it"):
+        run(out, seeds=SEEDS[:2], videos=0)
+
+
 class Blind(PointMass):
     """Has lost its renderer."""
 

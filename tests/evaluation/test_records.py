@@ -48,6 +48,28 @@ def test_a_torn_last_line_is_cut_and_its_episode_played_again(tmp_path):
         assert path.read_bytes() == whole
 
 
+def test_a_damaged_line_is_named_with_the_remedy_and_the_file_stays(tmp_path):
+    path = tmp_path / "a.jsonl"
+    with EpisodeLog(path) as log:
+        for result in episodes([1, 2, 3]):
+            log.append(result)
+    first, second, third = path.read_bytes().splitlines(keepends=True)
+    for damaged in (
+        second[:30] + b"\n",
+        b"{}\n",
+        b"[1]\n",
+        second.replace(b'"actions": "', b'"actions": "A'),
+        b"\xff\n",
+    ):
+        path.write_bytes(first + damaged + third)
+        with pytest.raises(OutputExistsError, match=r"line 2 of .*a\.jsonl is damaged: delete this line"):
+            EpisodeLog(path)
+        assert path.read_bytes() == first + damaged + third
+    path.write_bytes(first + third)  # what the message asks for
+    with EpisodeLog(path) as log:
+        assert (1 in log, 2 in log, 3 in log) == (True, False, True)
+
+
 def _append_for_ever(path):
     with EpisodeLog(path) as log:
         for seed in range(10_000):
@@ -93,7 +115,7 @@ def test_a_folder_of_other_files_and_a_file_are_refused_untouched(tmp_path):
 def test_a_second_writer_is_refused(tmp_path):
     with (
         claimed_folder(tmp_path / "r", REQUEST),
-        pytest.raises(OutputExistsError, match="another process"),
+        pytest.raises(OutputExistsError, match=f"written by process {os.getpid()}"),
         claimed_folder(tmp_path / "r", REQUEST),
     ):
         pass

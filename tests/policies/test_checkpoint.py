@@ -12,7 +12,7 @@ from safetensors.torch import load_file, save_file
 
 from manicm_ms.demos.stats import FieldStats
 from manicm_ms.errors import CheckpointError, ConfigError, OutputExistsError
-from manicm_ms.paths import sha256
+from manicm_ms.paths import set_aside, sha256
 from manicm_ms.policies.base import make_policy
 from manicm_ms.policies.checkpoint import load_checkpoint, read_manifest, save_checkpoint
 from manicm_ms.policies.diffusion import OneStepTeacher
@@ -254,11 +254,11 @@ def test_a_kill_while_saving_leaves_a_whole_checkpoint(folder):
         time.sleep(0.05 + 0.037 * moment)
         process.kill()
         process.join()
-        where = folder if folder.exists() else folder.with_name(folder.name + ".old")
+        where = folder if folder.exists() else set_aside(folder)
         assert any(torch.equal(act(load_checkpoint(where)), action) for action in wanted)
 
 
 def test_a_save_that_was_cut_off_between_its_renames_is_explained(folder):
-    folder.rename(folder.with_name("teacher.old"))
+    folder.rename(set_aside(folder))
     with pytest.raises(CheckpointError, match=r"rename .*teacher\.old to .*teacher"):
         load_checkpoint(folder)
