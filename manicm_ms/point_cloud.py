@@ -42,6 +42,24 @@ def inside(points: Tensor, box: Box) -> Tensor:
     return ((points > low) & (points < high)).all(dim=-1)
 
 
+_HEIGHT_MARGIN = 1e-4  # m: the height test below rounds differently from the full transform
+
+
+def crop_transformed(
+    points: NDArray[np.float32], T_out_in: NDArray[np.float32], box: Box
+) -> tuple[NDArray[np.int64], NDArray[np.float32]]:
+    """Map points (M, 3) to frame `out` and keep those strictly inside `box`: their indices (K,) and xyz (K, 3).
+
+    The same as `transform` and `inside`, but most points, those of the table, are dropped by their height alone.
+    """
+    height = points @ T_out_in[2, :3] + T_out_in[2, 3]
+    near = np.flatnonzero((height > box.low[2] - _HEIGHT_MARGIN) & (height < box.high[2] + _HEIGHT_MARGIN))
+    mapped = points[near] @ T_out_in[:3, :3].T + T_out_in[:3, 3]
+    low, high = np.array(box.low, np.float32), np.array(box.high, np.float32)
+    kept = ((mapped > low) & (mapped < high)).all(axis=1)
+    return near[kept], mapped[kept]
+
+
 def farthest_point_order(xyz: NDArray[np.float32], count: int) -> NDArray[np.int64]:
     """Return the indices of `count` points in farthest-point order.
 

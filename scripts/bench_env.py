@@ -146,13 +146,15 @@ def shares(env_id: str, steps: int) -> dict[str, float]:
     simulator = entry.build(config.specialise(entry.spec), config)
     assert isinstance(simulator, ManiSkillSimulator)
     rows, watch, only = ActionChunk(simulator), Stopwatch(), torch.zeros(1, dtype=torch.int64)
-    _watch_parts(watch, simulator)
+    _watch_simulator(watch, simulator)
     rng = np.random.default_rng(0)
     rows.reset(only, [0])
+    _watch_scene(watch, simulator)
     for step in range(WARM_UP_STEPS + steps):
         if (rows.terminated | rows.truncated).any():
             watch.running = False
             rows.reset(only, [step])
+            _watch_scene(watch, simulator)
         watch.running = step >= WARM_UP_STEPS
         action = rng.uniform(-SMALL, SMALL, (1, 1, simulator.spec.action.dim)).astype(np.float32)
         with watch.part("all"):
@@ -163,14 +165,17 @@ def shares(env_id: str, steps: int) -> dict[str, float]:
     return parts | {"rest (observation of the robot, bookkeeping)": total - sum(parts.values())}
 
 
-def _watch_parts(watch: Stopwatch, simulator: ManiSkillSimulator) -> None:
-    env = simulator.env
-    watch.watch(env.scene, "step", "physics")
+def _watch_simulator(watch: Stopwatch, simulator: ManiSkillSimulator) -> None:
     watch.watch(simulator, "_shoot", "rendering")
     watch.watch(simulator, "_pictures", "rendering")
     watch.watch(simulator, "_cloud", "cloud (frame, crop, sampling)")
-    watch.watch(env.agent, "set_action", "controller (limits, inverse kinematics)")
-    watch.watch(env, "evaluate", "evaluate")
+    watch.watch(simulator.env, "evaluate", "evaluate")
+
+
+def _watch_scene(watch: Stopwatch, simulator: ManiSkillSimulator) -> None:
+    """Watch what every reset builds anew."""
+    watch.watch(simulator.env.scene, "step", "physics")
+    watch.watch(simulator.env.agent, "set_action", "controller (limits, inverse kinematics)")
 
 
 # ---- the report -----------------------------------------------------------------------------------------------

@@ -5,7 +5,15 @@ import pytest
 import torch
 
 from manicm_ms import point_cloud
-from manicm_ms.point_cloud import Box, farthest_point_order, inside, sample_cloud, sample_cloud_batch, transform
+from manicm_ms.point_cloud import (
+    Box,
+    crop_transformed,
+    farthest_point_order,
+    inside,
+    sample_cloud,
+    sample_cloud_batch,
+    transform,
+)
 
 
 def brute_force_order(xyz: np.ndarray, count: int, first: int) -> list[int]:
@@ -87,3 +95,16 @@ def test_inside_excludes_the_faces():
     box = Box((0, 0, 0), (1, 1, 1))
     probes = torch.tensor([[0.5, 0.5, 0.5], [0.0, 0.5, 0.5], [0.5, 1.0, 0.5], [0.5, 0.5, 1.1]])
     assert inside(probes, box).tolist() == [True, False, False, False]
+
+
+def test_crop_equals_transform_and_inside(points):
+    rotation, _ = np.linalg.qr(np.random.default_rng(5).normal(size=(3, 3)))
+    T = np.eye(4, dtype=np.float32)
+    T[:3, :3], T[:3, 3] = rotation, (0.2, -0.1, 0.3)
+    box = Box((-0.5, -0.8, -0.2), (0.9, 0.7, 0.6))
+    everywhere = transform(torch.from_numpy(points), torch.from_numpy(T))
+    expected = inside(everywhere, box).numpy()
+    index, kept = crop_transformed(points, T, box)
+    assert 10 < len(index) < len(points)
+    np.testing.assert_array_equal(index, np.flatnonzero(expected))
+    np.testing.assert_allclose(kept, everywhere.numpy()[expected], atol=1e-6)

@@ -16,6 +16,7 @@ from typing import Any, Literal
 import tyro
 
 from manicm_ms.errors import ConfigError, ManicmError, UnknownNameError
+from manicm_ms.paths import is_disk_full
 
 Backend = Literal["auto", "cpu", "gpu"]
 Command = Callable[..., int | None]
@@ -225,7 +226,7 @@ def _overview() -> None:
 
 def _explain(error: OSError) -> str:
     """Say which file is in trouble, why and what to try; raise `error` again where it is about no file and no disk."""
-    if error.errno in (errno.ENOSPC, errno.EDQUOT):
+    if is_disk_full(error):
         return f"no space left on the disk ({error.filename or 'output'}): free some and give the same command"
     if error.filename is None:
         raise error

@@ -20,7 +20,7 @@ from manicm_ms.envs.cameras import CLOUD_POSITION, COLOR, MICROMETRE, cloud_shad
 from manicm_ms.envs.simulator import Simulator, SimulatorConfig, StepResult  # noqa: E402
 from manicm_ms.envs.ur3e_tabletop import UR3eTabletopEnv  # noqa: E402
 from manicm_ms.errors import RenderDeviceError  # noqa: E402
-from manicm_ms.point_cloud import inside, sample_cloud, sample_cloud_batch, transform  # noqa: E402
+from manicm_ms.point_cloud import crop_transformed, inside, sample_cloud, sample_cloud_batch, transform  # noqa: E402
 from manicm_ms.types import AGENT_POS, DEPTH, IMAGE, POINT_CLOUD, STATE, EnvSpec  # noqa: E402
 
 VIDEO_SHADER = "default"
@@ -112,20 +112,29 @@ class ManiSkillSimulator(Simulator):
         return dict(zip(names, self._camera.camera.get_picture(names), strict=True))
 
     def _cloud(self, position: Tensor, color: Tensor | None) -> Tensor:
-        n = len(position)
-        xyz = position[..., :3].reshape(n, -1, 3) * MICROMETRE
-        hit = position[..., 3].reshape(n, -1) != 0  # the background carries segmentation id 0
+        """Return clouds (n, P, C) of camera-space positions (n, H, W, 4) int32 and rgba (n, H, W, 4) uint8."""
         if self._T_base_camera is None:
             T_world_camera = self._camera.camera.get_model_matrix()
             T_base_world = self.env.agent.robot.pose.inv().to_transformation_matrix()
             self._T_base_camera = (T_base_world @ T_world_camera).float()
-        xyz = transform(xyz, self._T_base_camera)
-        valid = hit & inside(xyz, self.env.workspace)
+        if self.device.type == "cpu":
+            return torch.stack([self._row_cloud(k, position, color) for k in range(len(position))])
+        n = len(position)
+        xyz = transform(position[..., :3].reshape(n, -1, 3) * MICROMETRE, self._T_base_camera)
+        hit = position[..., 3].reshape(n, -1) != 0  # the background carries segmentation id 0
         points = xyz if color is None else torch.cat([xyz, color[..., :3].reshape(n, -1, 3) / 255.0], dim=-1)
-        if self.device.type != "cpu":
-            return sample_cloud_batch(points, valid, self.config.num_points)
-        clouds = [sample_cloud(p[v].numpy(), self.config.num_points) for p, v in zip(points, valid, strict=True)]
-        return torch.from_numpy(np.stack(clouds))
+        return sample_cloud_batch(points, hit & inside(xyz, self.env.workspace), self.config.num_points)
+
+    def _row_cloud(self, row: int, position: Tensor, color: Tensor | None) -> Tensor:
+        assert self._T_base_camera is not None
+        pixels = position[row].reshape(-1, 4).numpy()
+        hit = np.flatnonzero(pixels[:, 3])
+        xyz = pixels[hit, :3] * np.float32(MICROMETRE)
+        index, points = crop_transformed(xyz, self._T_base_camera[row].numpy(), self.env.workspace)
+        if color is not None:
+            rgb = color[row].reshape(-1, color.shape[-1])[:, :3].numpy()[hit[index]]
+            points = np.concatenate([points, rgb / np.float32(255)], axis=1)
+        return torch.from_numpy(sample_cloud(points, self.config.num_points))
 
     def render_video_frames(self) -> Tensor:
         """See `Simulator.render_video_frames`."""

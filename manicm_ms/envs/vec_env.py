@@ -22,7 +22,7 @@ from torch import Tensor
 from manicm_ms import sapien_gpu
 from manicm_ms.envs.chunk import ActionChunk
 from manicm_ms.envs.simulator import ENVS, EnvEntry, SimulatorConfig
-from manicm_ms.envs.worker import RowEnv, action_space, observation_space
+from manicm_ms.envs.worker import FACTS, RowEnv, action_space, observation_space
 from manicm_ms.errors import ActionError, BackendError, ConfigError, ManicmError
 from manicm_ms.types import AGENT_POS, POINT_CLOUD, ChunkSpec, EnvSpec
 
@@ -159,7 +159,7 @@ class CpuVecEnv(VecEnv):
         self._workers = AsyncVectorEnv(
             [make] * num_envs, context=_START_METHOD, autoreset_mode=AutoresetMode.DISABLED, copy=False
         )
-        self._info: dict[str, np.ndarray] = {}
+        self._facts: list[dict[str, Any]] = [{} for _ in range(num_envs)]
         self._video = config.video
         self._failure: str | None = None  # why no call can succeed any more
 
@@ -230,14 +230,12 @@ class CpuVecEnv(VecEnv):
         return {key: torch.from_numpy(values.copy()) for key, values in obs.items()}  # the workers' memory is reused
 
     def _merged(self, info: dict[str, Any], rows: np.ndarray) -> Info:
-        for name, values in info.items():
-            if name.startswith("_") or np.ndim(values) == 0:
-                continue
-            values = np.asarray(values)
-            known = self._info.setdefault(name, np.zeros_like(values))
-            self._info[name] = np.where(rows, values, known)
-        merged: Info = {name: torch.from_numpy(v.copy()) for name, v in self._info.items() if v.dtype != object}
-        merged["error"] = [reason or None for reason in self._info["error"].tolist()]
+        for row in rows.nonzero()[0]:
+            (self._facts[row],) = info[FACTS][row]
+        kinds = {name: type(value) for facts in self._facts for name, value in facts.items() if name != "error"}
+        # A row that was not stepped since its reset does not know the task's facts yet: they are False or 0.
+        merged: Info = {n: torch.tensor([f.get(n, kind()) for f in self._facts]) for n, kind in kinds.items()}
+        merged["error"] = [facts["error"] for facts in self._facts]
         return merged
 
 

@@ -42,8 +42,15 @@ def action_space(spec: EnvSpec, n_action_steps: int | None) -> spaces.Box:
     return spaces.Box(-1.0, 1.0, (*chunk, spec.action.dim), np.float32)
 
 
+FACTS = "facts"
+"""The one key of a worker's info: a tuple that holds a dictionary of plain values."""
+
+
 class RowEnv(gymnasium.Env[dict[str, np.ndarray], np.ndarray]):
     """One row of a registered environment.
+
+    Everything runs in torch's inference mode: a control step is some hundred tiny tensor operations, and bookkeeping
+    for gradients would cost a third of it. What leaves the process are NumPy arrays.
 
     The simulator is built at the first reset, in the process that will use it: gymnasium's AsyncVectorEnv also makes
     one environment in the parent, only to read its spaces, and a renderer there would cost memory and seconds.
@@ -62,6 +69,7 @@ class RowEnv(gymnasium.Env[dict[str, np.ndarray], np.ndarray]):
         self.action_space = action_space(self.env_spec, chunk.n_action_steps if chunk else None)
         self._rows: ActionChunk | None = None
 
+    @torch.inference_mode()
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
@@ -83,6 +91,7 @@ class RowEnv(gymnasium.Env[dict[str, np.ndarray], np.ndarray]):
             raise RuntimeError(f"building {self._env_id} failed in its worker:\n{traceback.format_exc()}") from error
         return ActionChunk.from_spec(simulator, self._chunk)
 
+    @torch.inference_mode()
     def step(self, action: np.ndarray) -> tuple[dict[str, np.ndarray], float, bool, bool, dict[str, Any]]:
         """Play one action, or a chunk of them."""
         assert self._rows is not None, "reset before the first step"
@@ -91,6 +100,7 @@ class RowEnv(gymnasium.Env[dict[str, np.ndarray], np.ndarray]):
         ended = bool(self._rows.terminated[0]), bool(self._rows.truncated[0])
         return self._unbatch(history), float(reward[0]), *ended, self._plain(info)
 
+    @torch.inference_mode()
     def render(self) -> np.ndarray:
         """Return what the wide camera sees, (H, W, 3) uint8."""
         assert self._rows is not None, "reset before the first frame"
@@ -106,5 +116,7 @@ class RowEnv(gymnasium.Env[dict[str, np.ndarray], np.ndarray]):
         return {key: (values[0] if self._chunk else values[0, 0]).numpy() for key, values in history.items()}
 
     def _plain(self, info: dict[str, torch.Tensor]) -> dict[str, Any]:
+        """Return the facts as one object: Gymnasium would build two arrays for each name at every step."""
         assert self._rows is not None
-        return {name: values[0].item() for name, values in info.items()} | {"error": self._rows.errors[0] or ""}
+        facts = {name: values[0].item() for name, values in info.items()}
+        return {FACTS: (facts | {"error": self._rows.errors[0]},)}  # in a tuple, for dictionaries are taken apart
