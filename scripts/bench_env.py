@@ -31,6 +31,7 @@ from manicm_ms.envs.chunk import ActionChunk  # noqa: E402
 from manicm_ms.envs.maniskill import ManiSkillSimulator  # noqa: E402
 from manicm_ms.envs.simulator import ENVS, SimulatorConfig  # noqa: E402
 from manicm_ms.envs.vec_env import VecEnv, make_vec  # noqa: E402
+from manicm_ms.envs.worker import RowEnv  # noqa: E402
 
 OUT = Path(__file__).resolve().parents[1] / "docs" / "results" / "env_speed.md"
 SIZE, STOCK_ID = 84, "PickCube-v1"
@@ -182,24 +183,27 @@ def _watch_scene(watch: Stopwatch, simulator: ManiSkillSimulator) -> None:
 
 
 def bench_against_stock(env_id: str, repetitions: int) -> str:
-    """Run one worker of ours and stock ManiSkill in turn; return Markdown."""
+    """Run one worker of ours, the same without the process around it, and stock ManiSkill in turn; return Markdown."""
     ours = make_vec(env_id, 1, "cpu", image_size=(SIZE, SIZE))
+    row = RowEnv(env_id, ENVS.get(env_id).module, SimulatorConfig(image_size=(SIZE, SIZE)), None)
     camera = {"width": SIZE, "height": SIZE}
     stock = gymnasium.make(STOCK_ID, num_envs=1, obs_mode="pointcloud", sensor_configs=camera)
     try:
-        players = {env_id: vec_player(ours, 0), STOCK_ID: stock_player(stock, 0)}
-        timed = in_turn(players, {env_id: 200, STOCK_ID: 40}, 1, repetitions)
+        worker, here = f"{env_id}, one worker", f"{env_id}, in the measuring process"
+        players = {worker: vec_player(ours, 0), here: stock_player(row, 0), STOCK_ID: stock_player(stock, 0)}
+        timed = in_turn(players, {worker: 200, here: 200, STOCK_ID: 40}, 1, repetitions)
     finally:
-        ours.close()
-        stock.close()
-    ratios = np.array(timed[env_id].rates) / np.array(timed[STOCK_ID].rates)
+        for env in (ours, row, stock):
+            env.close()
+    stock_rates = np.array(timed[STOCK_ID].rates)
     lines = [
         "| | control steps/s: median | best | CPU ms per step |",
         "|---|---|---|---|",
         *(_row(name, t) for name, t in timed.items()),
         "",
-        f"Ratio of the two, repetition by repetition: median **{np.median(ratios):.1f}**, "
-        f"{ratios.min():.1f} to {ratios.max():.1f} over {len(ratios)}.",
+        "Ratio to PickCube-v1, repetition by repetition:",
+        "",
+        *(f"- {name}: {_spread(np.array(timed[name].rates) / stock_rates)}" for name in (worker, here)),
     ]
     return "\n".join(lines)
 
@@ -215,6 +219,10 @@ def bench_rows(env_id: str, backend: str, counts: list[int], repetitions: int) -
         finally:
             env.close()
     return "\n".join(lines)
+
+
+def _spread(ratios: np.ndarray) -> str:
+    return f"median **{np.median(ratios):.1f}**, {ratios.min():.1f} to {ratios.max():.1f} over {len(ratios)}"
 
 
 def _row(name: str, timed: Timed) -> str:

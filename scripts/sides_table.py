@@ -26,21 +26,27 @@ def approach(episode: EpisodeResult) -> float:
     return float(actions[:, Y].sum() * TCP_STEP)
 
 
+def ways(report: Path, policy: str) -> np.ndarray:
+    """Return the way of each episode, m, in the order of seeds."""
+    lines = (report / "episodes" / f"{slug(policy)}.jsonl").read_text().splitlines()
+    episodes = sorted((EpisodeResult.from_record(json.loads(line)) for line in lines), key=lambda e: e.seed)
+    return np.array([approach(episode) for episode in episodes])
+
+
 def main(report: tyro.conf.Positional[Path]) -> None:
     """Print the table.
 
     Args:
         report: folder of a finished evaluation.
     """
-    print("| policy | episodes that go to -y first | to +y first | median distance, mm | median steps of a success |")
-    print("|---|---|---|---|---|")
-    for policy in json.loads((report / "results.json").read_text())["policies"]:
-        lines = (report / "episodes" / f"{slug(policy['name'])}.jsonl").read_text().splitlines()
-        episodes = [EpisodeResult.from_record(json.loads(line)) for line in lines]
-        ways = np.array([approach(e) for e in episodes])
-        steps = np.median([e.steps for e in episodes if e.success])
-        distance = 1000 * np.median(np.abs(ways))
-        print(f"| {policy['name']} | {(ways < 0).sum()} | {(ways > 0).sum()} | {distance:.0f} | {steps:.0f} |")
+    names = [policy["name"] for policy in json.loads((report / "results.json").read_text())["policies"]]
+    teacher = ways(report, names[0])
+    print("| policy | first goes to -y | first goes to +y | same side as the teacher on the same seed |")
+    print("|---|---|---|---|")
+    for name in names:
+        way = ways(report, name)
+        agree = (np.sign(way) == np.sign(teacher)).sum()
+        print(f"| {name} | {(way < 0).sum()} | {(way > 0).sum()} | {agree} of {len(way)} |")
 
 
 if __name__ == "__main__":

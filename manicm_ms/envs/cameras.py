@@ -54,7 +54,7 @@ D435I = FixedCamera(eye=(0.710, 0.280, 0.432), target=(0.31, 0.0, 0.05), fov=0.7
 compared, that loses fewest points of a grasped object. The depth stream's centre crop at 84x84 would span 64 deg;
 the crop here keeps the middle 43 deg of it."""
 
-WIDE = FixedCamera(eye=(0.95, 0.45, 0.50), target=(0.20, 0.0, 0.19), fov=0.80, size=(360, 480))
+WIDE = FixedCamera(eye=(1.02, 0.48, 0.54), target=(0.20, 0.0, 0.21), fov=0.84, size=(360, 480))
 """Looks at the whole cell, for videos."""
 
 
