@@ -76,6 +76,7 @@ class _Surveyor:
         self.ends = np.zeros(0, np.int64)
 
     def run(self) -> Survey:
+        """Look at everything and return what was found."""
         self.result.bytes_on_disk = sum(f.stat().st_size for f in self.path.rglob("*") if f.is_file())
         self._attributes()
         self._episodes()

@@ -82,6 +82,7 @@ class _Checks:
         self._episode = self._play(self.env, _SEEDS)
 
     def spaces_hold(self) -> None:
+        """Shapes, dtypes and device are those of the spaces."""
         for frame in self._episode:
             for key, values in frame.items():
                 space = self.env.observation_space[key]  # type: ignore[index]
@@ -91,15 +92,18 @@ class _Checks:
                 _require(values.device.type == self.env.device.type, f"{key} lies on {values.device}")
 
     def observations_finite(self) -> None:
+        """No NaN, no infinity."""
         for frame in self._episode:
             for key, values in frame.items():
                 _require(torch.isfinite(values.float()).all(), f"{key} holds NaN or infinity")
 
     def same_seed_same_episode(self) -> None:
+        """Playing the same seeds again gives the same frames."""
         again = self._promised(self._play(self.env, _SEEDS))
         _assert_equal(self._promised(self._episode), again, "a second run of the same seeds")
 
     def seed_decides_whatever_num_envs(self) -> None:
+        """A seed gives the same frames alone in another process as beside others."""
         alone = self._make(1, obs=_EVERY_KEY)
         try:
             second = [{k: v[1:] for k, v in frame.items()} for frame in self._promised(self._episode)]
@@ -109,20 +113,24 @@ class _Checks:
             alone.close()
 
     def other_seed_other_start(self) -> None:
+        """Two seeds start differently."""
         first = self._episode[0]
         _require(any(not torch.equal(v[0], v[1]) for v in first.values()), "two seeds gave one and the same start")
 
     def observations_vary(self) -> None:
+        """Proprioception answers to actions."""
         moved = self._episode[-1][AGENT_POS] - self._episode[0][AGENT_POS]
         _require(moved.abs().max() > 1e-4, "agent_pos does not answer to actions")
 
     def observations_share_no_memory(self) -> None:
+        """What was handed out does not change when the environment goes on."""
         kept = {k: v.clone() for k, v in self.env.reset(seed=list(_SEEDS))[0].items()}
         held, _ = self.env.reset(seed=list(_SEEDS))
         self.env.step(self._actions(self.env)[0])
         _assert_equal([kept], [held], "an observation handed out earlier")
 
     def partial_reset_leaves_others(self) -> None:
+        """Rows outside the mask keep their observation and their count."""
         self.env.reset(seed=list(_SEEDS))
         before = self.env.step(self._actions(self.env)[0])[0]
         mask = np.array([True, False])
@@ -146,6 +154,7 @@ class _Checks:
         _assert_equal([_row(self._episode[-1], 1)], [_row(last, 1)], "the row that was not reset")
 
     def bad_actions_refused(self) -> None:
+        """NaN and wrong shapes raise ActionError, in one line."""
         self.env.reset(seed=list(_SEEDS))
         good = self._actions(self.env)[0]
         nan = good.clone()
@@ -159,6 +168,7 @@ class _Checks:
             raise ViolationError(f"an action with {name} was accepted")
 
     def out_of_range_clipped_and_counted(self) -> None:
+        """Entries beyond [-1, 1] act as the limit does, and are counted."""
         big = self._actions(self.env)[0].clone()
         big[:, 0] = 5.0
         limit = big.clamp(-1, 1)
@@ -171,12 +181,14 @@ class _Checks:
         _require(info["clipped"].tolist() == [1, 1], f"info['clipped'] is {info['clipped'].tolist()}, not [1, 1]")
 
     def info_complete(self) -> None:
+        """Every info holds the promised names, shapes and dtypes."""
         _, reset_info = self.env.reset(seed=list(_SEEDS))
         *_, info = self.env.step(self._actions(self.env)[0])
         for facts in (reset_info, info):
             _check_info(facts, self.env.num_envs)
 
     def chunk_equals_single_steps(self) -> None:
+        """A chunk returns the last frames that its actions give one by one."""
         chunk = ChunkSpec(n_obs_steps=2, horizon=4, n_action_steps=3)
         env = self._make(1, obs=(POINT_CLOUD, AGENT_POS), chunk=chunk)
         try:
@@ -196,6 +208,7 @@ class _Checks:
             _require(torch.equal(values[0, 1], last[key]), f"history of {key}: not the last frame")
 
     def time_limit_truncates_and_freezes(self) -> None:
+        """The episode ends at its limit; later steps change nothing and earn nothing."""
         env = self._make(1, obs=(AGENT_POS,))
         try:
             env.reset(seed=[_SEEDS[0]])

@@ -139,7 +139,7 @@ def evaluate(
         BackendError.
     """
     from manicm_ms.envs.simulator import ENVS
-    from manicm_ms.envs.vec_env import default_num_envs, make_vec, resolve_backend
+    from manicm_ms.envs.vec_env import default_num_envs, resolve_backend
 
     device = str(resolve_device(device))
     if episodes < 1:
@@ -151,15 +151,6 @@ def evaluate(
     for contender in contenders:
         _require_made_for(spec, contender)
 
-    def for_policy(policy: Policy, n: int) -> VecEnv:
-        obs = policy.spec.obs
-        return make_vec(
-            env_id, n, backend, chunk=policy.chunk, num_points=obs.num_points, colors=obs.point_channels == 6
-        )
-
-    def for_film(n: int) -> VecEnv:
-        return make_vec(env_id, n, backend, obs=(AGENT_POS,), video=True)
-
     request = {
         "env_id": env_id,
         "seed": seed,
@@ -169,7 +160,22 @@ def evaluate(
         "policies": [[c.name, c.role, checkpoint_digest(c.checkpoint)] for c in contenders],
     }
     command = command or _command(checkpoints, env_id, episodes, seed, out)
-    return judge(contenders, protocol, EnvMaker(for_policy, for_film), out, request, command, console or Console())
+    return judge(contenders, protocol, _env_maker(env_id, backend), out, request, command, console or Console())
+
+
+def _env_maker(env_id: str, backend: str) -> EnvMaker:
+    from manicm_ms.envs.vec_env import make_vec
+
+    def for_policy(policy: Policy, n: int) -> VecEnv:
+        obs = policy.spec.obs
+        return make_vec(
+            env_id, n, backend, chunk=policy.chunk, num_points=obs.num_points, colors=obs.point_channels == 6
+        )
+
+    def for_film(n: int) -> VecEnv:
+        return make_vec(env_id, n, backend, obs=(AGENT_POS,), video=True)
+
+    return EnvMaker(for_policy, for_film)
 
 
 def load_contenders(checkpoints: Sequence[Path], device: str = "cpu", control: bool = True) -> list[Contender]:
