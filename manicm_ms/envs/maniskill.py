@@ -60,7 +60,7 @@ class ManiSkillSimulator(Simulator):
     def _reset_options(self, rows: Tensor) -> dict[str, Any]:
         """Return how ManiSkill is to reset `rows`: one row alone gets a fresh scene, rows of a batch cannot.
 
-        PhysX keeps what it learnt of earlier contacts: in a used scene the same seed parts by millimetres from its
+        PhysX keeps something of earlier contacts: in a used scene the same seed parts by millimetres from its
         first run as soon as something is touched (docs/decisions/0010). A new scene costs 0.03 s.
         """
         if self.num_rows > 1:

@@ -391,6 +391,7 @@ class _Bench:
         self.spec: EnvSpec | None = None
 
     def home(self, contender: Contender) -> RestartableEnv:
+        """Return an env that plays the contender's chunks, the one at hand where it does."""
         policy = contender.policy
         shape = _exchange(policy.chunk, policy.spec)
         if self._home is None or shape != self._shape:

@@ -207,6 +207,7 @@ class _Rollout:
         self.restarts = 0
 
     def run(self) -> dict[int, EpisodeResult]:
+        """Play all pending seeds; return seed -> result."""
         while self.pending or any(self.rows):
             try:
                 self._start_episodes()
