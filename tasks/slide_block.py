@@ -9,18 +9,16 @@ from typing import ClassVar
 import numpy as np
 import sapien
 import torch
-from mani_skill.utils.geometry.rotation_conversions import axis_angle_to_quaternion
 from mani_skill.utils.registration import register_env
 from mani_skill.utils.structs import Actor, Pose
 from torch import Tensor
 
-from manicm_ms.demos.experts import EXPERTS
+from manicm_ms.demos.experts import EXPERTS, require_style
 from manicm_ms.demos.waypoints import Motion, WaypointFollower, waypoint_table
 from manicm_ms.envs.maniskill import ManiSkillSimulator
 from manicm_ms.envs.simulator import ENVS, EnvEntry
 from manicm_ms.envs.ur3e_tabletop import SPAWN_CLEARANCE, UR3eTabletopEnv, pose_error, ur3e_spec
-from manicm_ms.errors import UnknownNameError
-from manicm_ms.robots.limits import pose_in_frame
+from manicm_ms.robots.limits import pose_in_frame, quat_from_yaw
 from manicm_ms.robots.ur3e_ag95 import OPENING_MAX, TCP_STEP, TCP_TURN
 from manicm_ms.types import EnvSpec
 
@@ -72,9 +70,9 @@ class SlideBlockEnv(UR3eTabletopEnv):
         off = torch.as_tensor(rng.uniform(-0.005, 0.005, size=2), dtype=torch.float32)
 
         on_table = torch.full((count, 1), CUBE_HALF + SPAWN_CLEARANCE)
-        cube = Pose.create_from_pq(torch.cat([xy, on_table], dim=1), _yaw_quat_wxyz(yaw[:, 0]))
+        cube = Pose.create_from_pq(torch.cat([xy, on_table], dim=1), quat_from_yaw(yaw[:, 0]))
         on_cube = torch.full((count, 1), 2 * CUBE_HALF + BLOCK_HALF[2] + 2 * SPAWN_CLEARANCE)
-        block = Pose.create_from_pq(torch.cat([xy + off, on_cube], dim=1), _yaw_quat_wxyz(yaw.sum(dim=1)))
+        block = Pose.create_from_pq(torch.cat([xy + off, on_cube], dim=1), quat_from_yaw(yaw.sum(dim=1)))
         self.cube.set_pose(cube)
         self.block.set_pose(block)
         self.cube_start[rows] = cube.raw_pose
@@ -117,11 +115,6 @@ class SlideBlockEnv(UR3eTabletopEnv):
         }
 
 
-def _yaw_quat_wxyz(yaw: Tensor) -> Tensor:
-    """Return the rotation by `yaw` (N,) rad about z as quaternions (N, 4)."""
-    return axis_angle_to_quaternion(torch.stack([torch.zeros_like(yaw), torch.zeros_like(yaw), yaw], dim=1))
-
-
 ENVS.add(ENV_ID, EnvEntry(SPEC, partial(ManiSkillSimulator, gym_id=GYM_ID), __name__), tags=("ur3e", "real-robot"))
 
 
@@ -147,9 +140,7 @@ class SlideBlockExpert:
     styles = ("one-sided", "two-sided")
 
     def __init__(self, spec: EnvSpec, num_envs: int, device: torch.device | str, style: str | None = None) -> None:
-        self.style = style or self.styles[0]
-        if self.style not in self.styles:
-            raise UnknownNameError("expert style", self.style, self.styles)
+        self.style = require_style(style, self.styles)
         self._layout = spec.state_layout
         motion = Motion(TCP_STEP, TCP_TURN, OPENING_MAX, control_hz=spec.action.control_hz)
         self._follower = WaypointFollower(spec, num_envs, motion, device)

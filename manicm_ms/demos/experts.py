@@ -7,6 +7,7 @@ from typing import Protocol
 
 import torch
 
+from manicm_ms.errors import UnknownNameError
 from manicm_ms.registry import Registry
 from manicm_ms.types import EnvSpec
 
@@ -47,3 +48,11 @@ ExpertFactory = Callable[[EnvSpec, int, torch.device, str | None], Expert]
 """Builds an expert from `(spec, num_envs, device, style)`; a style of None means the default one."""
 
 EXPERTS: Registry[ExpertFactory] = Registry("expert for env id", package="manicm_ms.tasks")
+
+
+def require_style(style: str | None, styles: Sequence[str]) -> str:
+    """Return `style`, or the first of `styles` for None; raise UnknownNameError for one that is not there."""
+    chosen = styles[0] if style is None else style
+    if chosen not in styles:
+        raise UnknownNameError("expert style", chosen, styles)
+    return chosen

@@ -163,6 +163,11 @@ def stopping_speed(distance: Tensor, deceleration: float, dt: float) -> Tensor:
     return (units / (braking + 1) + braking / 2) * (deceleration * dt)
 
 
+def smallest_turn(angle: Tensor, period: float) -> Tensor:
+    """Return the turn (N,) rad in [-period / 2, period / 2) that differs from `angle` (N,) by whole periods."""
+    return torch.remainder(angle + period / 2, period) - period / 2
+
+
 def waypoint_table(
     rows: Sequence[tuple[Tensor, Tensor | float, Tensor | float, float, int]], like: Tensor
 ) -> Waypoints:

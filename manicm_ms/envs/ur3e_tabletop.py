@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from abc import abstractmethod
+from collections.abc import Sequence
 from typing import Any, ClassVar
 
 import numpy as np
@@ -89,6 +90,7 @@ class UR3eTabletopEnv(BaseEnv):
 
     def __init__(self, *args: Any, robot_uids: str = "ur3e_ag95", **kwargs: Any) -> None:
         self.objects: dict[str, Actor] = {}
+        self.half_sizes: dict[str, Tensor] = {}
         super().__init__(*args, robot_uids=robot_uids, **kwargs)
 
     @property
@@ -117,6 +119,7 @@ class UR3eTabletopEnv(BaseEnv):
         super()._load_agent(options, sapien.Pose())
 
     def _load_scene(self, options: dict[str, Any]) -> None:
+        self.half_sizes = {}
         table = self.build_box("table", TABLE_HALF_SIZE, TABLE_COLOR, friction=self.table_friction)
         table.initial_pose = sapien.Pose(TABLE_CENTRE)
         self.table = table.build_static(name="table")
@@ -131,22 +134,41 @@ class UR3eTabletopEnv(BaseEnv):
         friction: float,
         mass: float | None = None,
     ) -> ActorBuilder:
-        """Return a builder of a box.
+        """Return a builder of a box, whose half edges (N, 3), m, then stand in `half_sizes[name]`.
 
         Args:
-            name: for error messages of the builder.
+            name: of the object.
             half_size: half of each edge, m.
             color: rgba in [0, 1].
             friction: material value; PhysX takes the average of the two touching materials.
             mass: kg; None for a body that never moves.
         """
+        self.half_sizes[name] = torch.tensor([half_size], device=self.device).repeat(self.num_envs, 1)
+        return self.build_boxes(name, [((0.0, 0.0, 0.0), half_size)], color, friction=friction, mass=mass)
+
+    def build_boxes(
+        self,
+        name: str,
+        parts: Sequence[tuple[tuple[float, float, float], tuple[float, float, float]]],
+        color: tuple[float, float, float, float],
+        *,
+        friction: float,
+        mass: float | None = None,
+    ) -> ActorBuilder:
+        """Return a builder of one body made of boxes: (centre in the body's frame, half of each edge), m.
+
+        The other arguments are those of `build_box`; the mass spreads over the parts by volume.
+        """
         builder = self.scene.create_actor_builder()
         builder.set_name(name)
         material = sapien.physx.PhysxMaterial(friction, friction, 0.0)
-        volume = 8.0 * half_size[0] * half_size[1] * half_size[2]
+        volume = sum(8.0 * half[0] * half[1] * half[2] for _, half in parts)
         density = 1000.0 if mass is None else mass / volume
-        builder.add_box_collision(half_size=half_size, material=material, density=density)
-        builder.add_box_visual(half_size=half_size, material=sapien.render.RenderMaterial(base_color=color))
+        paint = sapien.render.RenderMaterial(base_color=color)
+        for centre, half in parts:
+            pose = sapien.Pose(centre)
+            builder.add_box_collision(pose, half_size=half, material=material, density=density)
+            builder.add_box_visual(pose, half_size=half, material=paint)
         # Far apart, so that nothing overlaps before the first episode places it.
         builder.initial_pose = sapien.Pose((0.3, 0.1 * len(self.scene.actors), 0.5))
         return builder

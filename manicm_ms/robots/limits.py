@@ -1,4 +1,4 @@
-"""Bounds that keep commands executable: batched clamps of poses and joint steps, plain torch, no simulator.
+"""Bounds that keep commands executable: batched clamps of poses and joint steps, and the rotations they need.
 
 Quaternions are wxyz and of unit length; every function works on N rows at once and never mixes them.
 """
@@ -6,6 +6,7 @@ Quaternions are wxyz and of unit length; every function works on N rows at once 
 from __future__ import annotations
 
 import torch
+from mani_skill.utils.geometry.rotation_conversions import axis_angle_to_quaternion
 from torch import Tensor
 
 
@@ -35,6 +36,18 @@ def rotvec_from_quat(q: Tensor) -> Tensor:
     sine = torch.linalg.norm(q[:, 1:], dim=1, keepdim=True)
     angle = 2.0 * torch.atan2(sine, q[:, :1])
     return q[:, 1:] * torch.where(sine > 1e-9, angle / sine.clamp_min(1e-9), torch.full_like(sine, 2.0))
+
+
+def quat_from_yaw(yaw: Tensor) -> Tensor:
+    """Return the rotations by `yaw` (N,) rad about z as quaternions (N, 4)."""
+    still = torch.zeros_like(yaw)
+    return axis_angle_to_quaternion(torch.stack([still, still, yaw], dim=1))
+
+
+def yaw_of_quat(q: Tensor) -> Tensor:
+    """Return by how much unit quaternions (N, 4) turn the x axis about z, (N,) rad in (-pi, pi]."""
+    w, x, y, z = q.unbind(dim=-1)
+    return torch.atan2(2 * (w * z + x * y), 1 - 2 * (y * y + z * z))
 
 
 def quat_rotate(q: Tensor, vectors: Tensor) -> Tensor:
