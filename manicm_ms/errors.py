@@ -68,5 +68,13 @@ class BackendError(ManicmError):
     """A simulation backend that this machine cannot run."""
 
 
+class CameraError(ManicmError):
+    """A camera's description or a depth image that cannot be used."""
+
+
 class TrainingDivergedError(ManicmError):
     """A training whose loss became NaN or infinite."""
+
+
+class CalibrationError(ManicmError):
+    """Images or robot poses from which no camera pose can be solved."""

@@ -18,7 +18,7 @@ from manicm_ms import __version__
 REPO = Path(__file__).resolve().parents[1]
 MAPPED = {"manicm_ms": "manicm_ms", "tasks": "manicm_ms/tasks", "assets": "manicm_ms/assets"}
 CODE_AND_DATA = {".py", ".typed", ".urdf", ".glb", ".obj", ".stl", ".ply", ".vert", ".frag", ".json", ".md"} | {
-    ".j2", ".html", ".css", ".js",
+    ".yaml", ".j2", ".html", ".css", ".js",
 }  # fmt: skip
 
 
