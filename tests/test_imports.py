@@ -12,7 +12,10 @@ import pytest
 REPO = Path(__file__).resolve().parents[1]
 FOLDERS = {"manicm_ms": REPO / "manicm_ms", "manicm_ms.tasks": REPO / "tasks", "manicm_ms.assets": REPO / "assets"}
 SIMULATORS = {"sapien", "mani_skill", "mujoco", "metaworld", "mplib"}
-BASE = {"types", "errors", "registry", "paths", "point_cloud", "provenance", "devices", "seeds", "camera_model", "stereo_depth"}
+BASE = {
+    "types", "errors", "registry", "paths", "point_cloud", "provenance", "devices", "seeds", "camera_model",
+    "stereo_depth",
+}  # fmt: skip
 
 # layer -> the parts of manicm_ms that it may import beside itself and the base
 ALLOWED = {
