@@ -231,11 +231,7 @@ def collect(
     UnknownNameError for the id or the style, ManicmError where the expert fails far too often.
     """
     out, extras = Path(out), tuple(extras)
-    if episodes < 1 or num_envs < 1:
-        raise ConfigError(f"episodes and num_envs must be at least 1, got {episodes} and {num_envs}")
-    require_seed(seed)
-    if unknown := set(extras) - set(OPTIONAL_FIELDS):
-        raise ConfigError(f"extras {sorted(unknown)} are not known: choose from {', '.join(OPTIONAL_FIELDS)}")
+    _require_sound(episodes, num_envs, seed, extras)
     factory = EXPERTS.get(env_id)
     asked = {
         "env_id": env_id,
@@ -250,8 +246,7 @@ def collect(
     with ExitStack() as stack:
         # The lock is taken before the environment is made, so that a second writer is refused at once.
         store = stack.enter_context(DemoStore.open(out, "a")) if exists else None
-        obs = dict.fromkeys([POINT_CLOUD, AGENT_POS, STATE, *(_OBS_OF_FIELD[f] for f in extras)])
-        env = make_vec(env_id, num_envs=num_envs, backend=backend, obs=tuple(obs), colors=colors)
+        env = make_vec(env_id, num_envs=num_envs, backend=backend, obs=_obs_keys(extras), colors=colors)
         stack.callback(env.close)
         expert = factory(env.env_spec, num_envs, env.device, style)
         asked |= {"expert": expert.name, "style": expert.style, "backend": env.backend}
@@ -266,6 +261,40 @@ def collect(
             added = fill(store, collector, episodes, seed, report)
         store.note(command=command)
         return Collected(out, len(store), store.attempts, added)
+
+
+def collect_episodes(
+    env_id: str,
+    episodes: int,
+    *,
+    num_envs: int = 1,
+    seed: int = 0,
+    style: str | None = None,
+    backend: str = "auto",
+    colors: bool = False,
+    extras: Iterable[str] = (),
+    tail_steps: int = TAIL_STEPS,
+) -> list[Episode]:
+    """Collect demonstrations into memory: the episodes that `collect` stores for the same arguments.
+
+    Raises ConfigError, UnknownNameError, ManicmError as `collect`. An interruption loses them: for many, use `collect`.
+    """
+    extras = tuple(extras)
+    _require_sound(episodes, num_envs, seed, extras)
+    factory = EXPERTS.get(env_id)
+    kept: list[Episode] = []
+    with ExitStack() as stack:
+        env = make_vec(env_id, num_envs=num_envs, backend=backend, obs=_obs_keys(extras), colors=colors)
+        stack.callback(env.close)
+        expert = factory(env.env_spec, num_envs, env.device, style)
+        collector = Collector(env, expert, tail_steps=tail_steps, extras=extras)
+        report = stack.enter_context(_progress_bar(env_id, episodes, 0))
+        for tried, attempt in enumerate(collector.attempts(seed, episodes), start=1):
+            if attempt.episode is not None:
+                kept.append(attempt.episode)
+            report(len(kept), tried)
+            _require_hope(attempt, len(kept), tried, episodes, " are dropped")
+    return kept
 
 
 def fill(
@@ -290,7 +319,6 @@ def fill(
     tried = attempts_so_far(store, first_seed)
     if kept >= episodes:
         return 0
-    most = _FAILURES_PER_EPISODE * episodes + _FAILURES_FREE
     for attempt in collector.attempts(first_seed + tried, episodes - kept):
         tried += 1
         if attempt.episode is not None:
@@ -299,12 +327,31 @@ def fill(
         # After the commit, so that a kill between the two can only make this number too small.
         store.note(attempts=tried)
         report(kept, tried)
-        if tried - kept > most:
-            raise ManicmError(
-                f"{tried - kept} of {tried} attempts failed (seed {attempt.seed}: {attempt.reason}): gave up; the "
-                f"{kept} solved episodes are kept in {store.path}. Try another style or mend the expert of the task"
-            )
+        _require_hope(attempt, kept, tried, episodes, f" are kept in {store.path}")
     return kept - before
+
+
+def _require_hope(attempt: Attempt, kept: int, tried: int, wanted: int, fate: str) -> None:
+    """Raise ManicmError where far more attempts failed than a working expert's would; `fate` of the solved ones."""
+    if tried - kept > _FAILURES_PER_EPISODE * wanted + _FAILURES_FREE:
+        raise ManicmError(
+            f"{tried - kept} of {tried} attempts failed (seed {attempt.seed}: {attempt.reason}): gave up; the "
+            f"{kept} solved episodes{fate}. Try another style or mend the expert of the task"
+        )
+
+
+def _require_sound(episodes: int, num_envs: int, seed: int, extras: tuple[str, ...]) -> None:
+    """Raise ConfigError where a number is out of range or an extra is not known."""
+    if episodes < 1 or num_envs < 1:
+        raise ConfigError(f"episodes and num_envs must be at least 1, got {episodes} and {num_envs}")
+    require_seed(seed)
+    if unknown := set(extras) - set(OPTIONAL_FIELDS):
+        raise ConfigError(f"extras {sorted(unknown)} are not known: choose from {', '.join(OPTIONAL_FIELDS)}")
+
+
+def _obs_keys(extras: tuple[str, ...]) -> tuple[str, ...]:
+    """Return the observation keys that a `Collector` with these extras reads."""
+    return tuple(dict.fromkeys([POINT_CLOUD, AGENT_POS, STATE, *(_OBS_OF_FIELD[f] for f in extras)]))
 
 
 def attempts_so_far(store: DemoStore, first_seed: int) -> int:
