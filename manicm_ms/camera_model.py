@@ -26,7 +26,7 @@ PINHOLE = "pinhole"
 _ROTATION_TOLERANCE = 1e-4  # a rotation written with five digits passes
 _DEPTH_UNITS = (1e-5, 1e-2)  # m: ten micrometres to a centimetre
 _NEAREST, _FARTHEST = 0.1, 20.0  # m: readings that are all outside say that the unit is wrong
-_MAX_RAW = 65535  # largest value of a uint16
+MAX_RAW = 65535  # largest value of a uint16
 
 
 class Crop(NamedTuple):
@@ -357,7 +357,7 @@ def write_depth(path: Path, depth: Tensor, camera: CameraModel) -> None:
     """Write depth (height, width) in metres as a PNG that `read_depth` reads; readings are rounded to depth units."""
     import cv2  # a tenth of a second that who reads no pictures need not wait
 
-    raw = torch.round(depth.double() / camera.depth_unit).clamp(0, _MAX_RAW).numpy().astype(np.uint16)
+    raw = torch.round(depth.double() / camera.depth_unit).clamp(0, MAX_RAW).numpy().astype(np.uint16)
     done, data = cv2.imencode(".png", raw)
     assert done
     Path(path).write_bytes(data.tobytes())
