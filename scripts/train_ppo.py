@@ -1,0 +1,384 @@
+"""Trains PPO (Stable-Baselines3, extra `rl`) on a task's dense reward from privileged state, and draws its curve.
+
+python scripts/train_ppo.py train --seed 0                          # writes runs/ppo/0
+python scripts/train_ppo.py report runs/ppo/0 runs/ppo/1            # a table, and docs/images/ppo_slide_block.png
+
+After every few updates the policy plays episodes of its own; curve and weights are written then, so that a stopped run
+(Ctrl-C, --minutes) keeps all it had done. It is not continued: `train` begins anew, in a folder that must not exist.
+Weights are safetensors and read as such; Stable-Baselines3's own archive would be unpickled on reading.
+"""
+
+from __future__ import annotations
+
+import json
+import sys
+import time
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any, Protocol
+
+import numpy as np
+import torch
+import tyro
+from rich.console import Console
+from rich.progress import Progress
+from safetensors.torch import load_file, save_file
+from stable_baselines3 import PPO
+from stable_baselines3.common.callbacks import BaseCallback
+from stable_baselines3.common.policies import ActorCriticPolicy
+from stable_baselines3.common.vec_env import VecMonitor, VecNormalize
+from torch import Tensor
+
+from manicm_ms.demos.experts import EXPERTS
+from manicm_ms.devices import torch_threads
+from manicm_ms.envs.sb3 import AbsorbingSuccess, StableBaselinesEnv, normalized_return
+from manicm_ms.envs.vec_env import VecEnv, make_vec
+from manicm_ms.errors import ConfigError, ManicmError
+from manicm_ms.evaluation.statistics import wilson_interval
+from manicm_ms.paths import write_json
+from manicm_ms.provenance import package_versions
+from manicm_ms.training.interrupt import StopRequest, stop_requests
+from manicm_ms.types import STATE
+
+PICTURE = Path(__file__).resolve().parents[1] / "docs" / "images" / "ppo_slide_block.png"
+CURVE, WEIGHTS, RESULT = "curve.json", "policy.safetensors", "result.json"
+TRAINING_SEEDS = 1_000_000  # training of seed s plays episodes from (s + 1) times this; what is judged starts at 0
+FINAL_SEEDS = 10_000  # first seed of the episodes that judge the trained policy; those of the curve start at 0
+
+GAMMA = 0.96  # 25 control steps: the dense reward leads the way, the rest is variance
+PPO_SETTINGS: dict[str, Any] = {
+    "n_steps": 512,  # per row and update
+    "batch_size": 64,
+    "n_epochs": 10,
+    "learning_rate": 5e-4,
+    "gae_lambda": 0.95,
+    "gamma": GAMMA,
+    "target_kl": 0.05,
+}
+NETWORK: dict[str, Any] = {"net_arch": [128, 128], "log_std_init": -0.7}
+CLIP_OBS, STD_FLOOR = 10.0, 1e-8  # of normalised observations; VecNormalize's own epsilon
+
+
+@dataclass(frozen=True)
+class Train:
+    """Train one policy.
+
+    Attributes:
+        env: id of the environment.
+        seed: fixes weights, noise and training episodes.
+        steps: control steps of all rows.
+        rows: worker processes.
+        eval_every: control steps between two points of the curve.
+        eval_episodes: of each point; the same seeds at every point.
+        final_episodes: that judge the trained policy, random actions, idling and the expert.
+        minutes: stop after so long; None for never.
+        out: folder of the run; None for runs/ppo/<seed>.
+    """
+
+    env: str = "ur3e/slide-block"
+    seed: int = 0
+    steps: int = 250_000
+    rows: int = 2
+    eval_every: int = 10_000
+    eval_episodes: int = 20
+    final_episodes: int = 100
+    minutes: float | None = None
+    out: Path | None = None
+
+
+@dataclass(frozen=True)
+class Report:
+    """Print a table of finished runs and draw their curves.
+
+    Attributes:
+        runs: their folders.
+        picture: where the picture goes.
+    """
+
+    runs: tyro.conf.Positional[tuple[Path, ...]]
+    picture: Path = PICTURE
+
+
+# ---- playing --------------------------------------------------------------------------------------------------
+
+
+class Player(Protocol):
+    """Plays rows from their privileged state."""
+
+    def begin(self, state: Tensor, seeds: Sequence[int]) -> None:
+        """Start episodes in all rows: first states (N, S), seeds (N)."""
+
+    def act(self, state: Tensor) -> Tensor:
+        """Return actions (N, Da) for states (N, S)."""
+
+
+class RandomPlayer:
+    """Draws every entry uniformly from [-1, 1]."""
+
+    def __init__(self, action_dim: int, seed: int) -> None:
+        self._dim, self._generator = action_dim, torch.Generator().manual_seed(seed)
+
+    def begin(self, state: Tensor, seeds: Sequence[int]) -> None:
+        """Nothing to prepare."""
+
+    def act(self, state: Tensor) -> Tensor:
+        """See `Player.act`."""
+        return torch.rand(len(state), self._dim, generator=self._generator) * 2 - 1
+
+
+class IdlePlayer:
+    """Leaves the arm where it is."""
+
+    def __init__(self, action_dim: int) -> None:
+        self._dim = action_dim
+
+    def begin(self, state: Tensor, seeds: Sequence[int]) -> None:
+        """Nothing to prepare."""
+
+    def act(self, state: Tensor) -> Tensor:
+        """See `Player.act`."""
+        return torch.zeros(len(state), self._dim)
+
+
+class ExpertPlayer:
+    """Plays the task's scripted expert."""
+
+    def __init__(self, env: VecEnv) -> None:
+        spec = env.env_spec
+        self._expert = EXPERTS.get(spec.env_id)(spec, env.num_envs, torch.device("cpu"), None)
+
+    def begin(self, state: Tensor, seeds: Sequence[int]) -> None:
+        """See `Player.begin`."""
+        self._expert.reset(state, seeds, torch.ones(len(state), dtype=torch.bool))
+
+    def act(self, state: Tensor) -> Tensor:
+        """See `Player.act`."""
+        return self._expert.act(state)
+
+
+class PpoPlayer:
+    """Plays the mean action of a PPO policy.
+
+    Args:
+        policy: takes normalised states.
+        mean: (S,) of the states.
+        variance: (S,) of the states.
+    """
+
+    def __init__(self, policy: ActorCriticPolicy, mean: Tensor, variance: Tensor) -> None:
+        self._policy, self._mean, self._std = policy, mean, (variance + STD_FLOOR).sqrt()
+
+    def begin(self, state: Tensor, seeds: Sequence[int]) -> None:
+        """Nothing to prepare."""
+
+    def act(self, state: Tensor) -> Tensor:
+        """See `Player.act`."""
+        normal = ((state - self._mean) / self._std).clamp(-CLIP_OBS, CLIP_OBS).float()
+        action, _ = self._policy.predict(normal.numpy(), deterministic=True)
+        return torch.from_numpy(action)
+
+
+def save_policy(path: Path, model: PPO, normal: VecNormalize) -> None:
+    """Write a policy's weights and the statistics of its observations."""
+    fresh = path.with_suffix(".part")
+    statistics = {f"obs.{name}": torch.from_numpy(getattr(normal.obs_rms, name).copy()) for name in ("mean", "var")}
+    save_file({f"policy.{k}": v.contiguous() for k, v in model.policy.state_dict().items()} | statistics, fresh)
+    fresh.replace(path)
+
+
+def load_player(path: Path, env: VecEnv) -> PpoPlayer:
+    """Read what `save_policy` wrote for an environment with states of the same width."""
+    tensors = load_file(path)
+    venv = StableBaselinesEnv(env)
+    policy = ActorCriticPolicy(venv.observation_space, venv.action_space, lambda _: 0.0, **NETWORK)
+    policy.load_state_dict({k.removeprefix("policy."): v for k, v in tensors.items() if k.startswith("policy.")})
+    return PpoPlayer(policy, tensors["obs.mean"], tensors["obs.var"])
+
+
+@dataclass(frozen=True)
+class Score:
+    """Episodes of one player.
+
+    Attributes:
+        episodes: how many.
+        successes: of them.
+        mean_return: `normalized_return`, mean over the episodes, in [0, 1].
+        mean_steps: control steps played.
+    """
+
+    episodes: int
+    successes: int
+    mean_return: float
+    mean_steps: float
+
+
+def play(env: VecEnv, player: Player, seeds: Sequence[int]) -> Score:
+    """Play every seed once, N of them at a time."""
+    limit, parts = env.env_spec.max_episode_steps, []
+    for first in range(0, len(seeds), env.num_envs):
+        wanted = list(seeds[first : first + env.num_envs])
+        padded = wanted + wanted[-1:] * (env.num_envs - len(wanted))
+        obs, info = env.reset(seed=padded)
+        player.begin(obs[STATE], padded)
+        total, ended = torch.zeros(env.num_envs), torch.zeros(env.num_envs, dtype=torch.bool)
+        while not ended.all():
+            obs, reward, terminated, truncated, info = env.step(player.act(obs[STATE]).clamp(-1, 1))
+            total, ended = total + reward, terminated | truncated
+        success, steps = info["success_once"], info["elapsed_steps"]
+        value = normalized_return(total, steps, success, limit)
+        parts.append(torch.stack([success.float(), value, steps.float()], dim=1)[: len(wanted)])
+    success, value, steps = torch.cat(parts).double().T
+    return Score(len(seeds), int(success.sum()), float(value.mean()), float(steps.mean()))
+
+
+# ---- training -------------------------------------------------------------------------------------------------
+
+
+class CurveCallback(BaseCallback):
+    """Judges the policy every `eval_every` control steps, keeps curve and weights, and stops when asked."""
+
+    def __init__(self, args: Train, out: Path, judge: VecEnv, normal: VecNormalize, stop: StopRequest) -> None:
+        super().__init__()
+        self._args, self._out, self._judge, self._normal, self._stop = args, out, judge, normal, stop
+        self._points: list[dict[str, Any]] = []
+        self._began = time.monotonic()
+        self._progress = Progress(console=Console(file=sys.stderr))
+        self._task = self._progress.add_task(f"{args.env} seed {args.seed}", total=args.steps)
+
+    def _on_training_start(self) -> None:
+        self._progress.start()
+        self._evaluate()
+
+    def _on_step(self) -> bool:
+        self._progress.update(self._task, completed=self.num_timesteps)
+        limit = self._args.minutes
+        late = limit is not None and time.monotonic() - self._began > 60 * limit
+        return not (self._stop.asked or late)
+
+    def _on_rollout_start(self) -> None:  # the update that used the last roll-out has been done
+        if self.num_timesteps - self._points[-1]["steps"] >= self._args.eval_every:
+            self._evaluate()
+
+    def _on_training_end(self) -> None:
+        self._evaluate()
+        self._progress.stop()
+
+    def _evaluate(self) -> None:
+        """Add a point to the curve, and write curve and weights."""
+        save_policy(self._out / WEIGHTS, self.model, self._normal)  # type: ignore[arg-type]  # made by `train`
+        score = play(self._judge, load_player(self._out / WEIGHTS, self._judge), range(self._args.eval_episodes))
+        minutes = (time.monotonic() - self._began) / 60
+        self._points.append({"steps": self.num_timesteps, "minutes": round(minutes, 2), **asdict(score)})
+        write_json(self._out / CURVE, self._points)
+        self._progress.console.print(
+            f"{self.num_timesteps} steps, {minutes:.1f} min: return {score.mean_return:.3f}, "
+            f"success {score.successes}/{score.episodes}"
+        )
+
+
+def train(args: Train) -> None:
+    """Train, judge what was trained against random actions, idling and the expert, and write all of it."""
+    out = args.out or Path("runs") / "ppo" / str(args.seed)
+    if out.exists():
+        raise ConfigError(f"{out} exists: choose another --out, or remove it")
+    out.mkdir(parents=True)
+    training, judge = (
+        make_vec(args.env, args.rows, "cpu", obs=(STATE,), reward_mode="normalized_dense") for _ in range(2)
+    )
+    try:
+        with stop_requests() as stop:
+            minutes, steps = _learn(args, out, training, judge, stop)
+        scores = _judge_all(args, out, judge)
+    finally:
+        training.close()
+        judge.close()
+    versions = package_versions()
+    settings = {k: str(v) if isinstance(v, Path) else v for k, v in asdict(args).items()}
+    learnt = {"steps": steps, "minutes": round(minutes, 1)}
+    write_json(out / RESULT, {"settings": settings, **learnt, "scores": scores, "versions": versions})
+    print(json.dumps(scores, indent=2))
+
+
+def _learn(args: Train, out: Path, training: VecEnv, judge: VecEnv, stop: StopRequest) -> tuple[float, int]:
+    """Run PPO; return the minutes that it took, judging included, and the control steps played."""
+    rows = AbsorbingSuccess(VecMonitor(StableBaselinesEnv(training)), GAMMA)
+    # Rewards are scaled by the spread of the discounted return, and not clipped: a success is far from the others.
+    normal = VecNormalize(rows, clip_obs=CLIP_OBS, clip_reward=np.inf, gamma=GAMMA, epsilon=STD_FLOOR)
+    model = PPO("MlpPolicy", normal, seed=args.seed, device="cpu", policy_kwargs=NETWORK, **PPO_SETTINGS)
+    normal.seed((args.seed + 1) * TRAINING_SEEDS)  # PPO passes its own seed, which the judged episodes have too
+    began = time.monotonic()
+    model.learn(args.steps, callback=CurveCallback(args, out, judge, normal, stop))
+    return (time.monotonic() - began) / 60, model.num_timesteps
+
+
+def _judge_all(args: Train, out: Path, judge: VecEnv) -> dict[str, dict[str, Any]]:
+    players: dict[str, Player] = {
+        "ppo": load_player(out / WEIGHTS, judge),
+        "random actions": RandomPlayer(judge.env_spec.action.dim, args.seed),
+        "idle": IdlePlayer(judge.env_spec.action.dim),
+        "expert": ExpertPlayer(judge),
+    }
+    seeds = range(FINAL_SEEDS, FINAL_SEEDS + args.final_episodes)
+    return {name: asdict(play(judge, player, seeds)) for name, player in players.items()}
+
+
+# ---- the report -----------------------------------------------------------------------------------------------
+
+
+def report(args: Report) -> None:
+    """Print a Markdown table of the runs and draw the picture."""
+    results = [json.loads((run / RESULT).read_text(encoding="utf-8")) for run in args.runs]
+    print("| player | mean normalised return | success | 95 % interval | control steps played |\n|---|---|---|---|---|")
+    for result in results:
+        print(_row(f"PPO, seed {result['settings']['seed']}, {result['steps']} steps", result["scores"]["ppo"]))
+    for name in ("random actions", "idle", "expert"):
+        print(_row(name, results[0]["scores"][name]))
+    curves = [json.loads((run / CURVE).read_text(encoding="utf-8")) for run in args.runs]
+    _draw(results, curves, args.picture)
+
+
+def _row(name: str, score: dict[str, Any]) -> str:
+    low, high = (100 * bound for bound in wilson_interval(score["successes"], score["episodes"]))
+    success = f"{score['successes']}/{score['episodes']} | {low:.1f} to {high:.1f} %"
+    return f"| {name} | {score['mean_return']:.3f} | {success} | {score['mean_steps']:.0f} |"
+
+
+def _draw(results: list[dict[str, Any]], curves: list[list[dict[str, Any]]], picture: Path) -> None:
+    """Draw return and success rate against control steps; levels of the other players as lines."""
+    import matplotlib
+
+    matplotlib.use("Agg")
+    from matplotlib import pyplot as plt
+
+    figure, (left, right) = plt.subplots(1, 2, figsize=(10, 3.6), layout="constrained")
+    for result, curve in zip(results, curves, strict=True):
+        steps, label = [point["steps"] for point in curve], f"PPO, seed {result['settings']['seed']}"
+        left.plot(steps, [point["mean_return"] for point in curve], ".-", label=label)
+        right.plot(steps, [point["successes"] / point["episodes"] for point in curve], ".-", label=label)
+    for name, style in (("expert", "--"), ("idle", "-."), ("random actions", ":")):
+        score = results[0]["scores"][name]
+        left.axhline(score["mean_return"], color="black", linestyle=style, linewidth=1, label=name)
+        right.axhline(score["successes"] / score["episodes"], color="black", linestyle=style, linewidth=1)
+    episodes = curves[0][0]["episodes"]
+    for axes, title in ((left, "mean normalised return"), (right, f"success rate over {episodes} episodes")):
+        axes.set(xlabel="control steps", ylabel=title, ylim=(-0.02, 1.02))
+        axes.grid(alpha=0.3)
+    left.legend(fontsize="small")
+    picture.parent.mkdir(parents=True, exist_ok=True)
+    figure.savefig(picture, dpi=130)
+    print(picture)
+
+
+def main() -> None:
+    """Parse the command line and run; one line for what a user can mend."""
+    args = tyro.cli(Train | Report)  # type: ignore[arg-type]  # tyro takes unions
+    try:
+        with torch_threads(1):  # the workers need the cores
+            train(args) if isinstance(args, Train) else report(args)
+    except ManicmError as error:
+        sys.exit(f"error: {error}")
+
+
+if __name__ == "__main__":
+    main()
