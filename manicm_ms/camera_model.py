@@ -285,10 +285,11 @@ def _camera_of(content: Any) -> CameraModel:
             raise CameraError(f"field {name} is missing: it must be {accepted}")
         if name in content and not _accepts(name, content[name]):
             raise CameraError(f"field {name} is {content[name]!r}: it must be {accepted}")
-    values = {field.name: content[field.name] for field in fields(CameraModel) if field.name in content}
+    values: dict[str, Any] = {field.name: content[field.name] for field in fields(CameraModel) if field.name in content}
     values["crop"] = Crop(**content["crop"])
     values["T_base_camera"] = tuple(tuple(float(x) for x in row) for row in content["T_base_camera"])
-    return CameraModel(**{name: float(v) if _ACCEPTED[name].startswith(_NUMBER) else v for name, v in values.items()})
+    values |= {name: float(value) for name, value in values.items() if _ACCEPTED[name].startswith(_NUMBER)}
+    return CameraModel(**values)
 
 
 def _accepts(name: str, value: Any) -> bool:

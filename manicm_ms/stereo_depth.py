@@ -7,7 +7,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, fields
 from functools import lru_cache
 from statistics import NormalDist
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
@@ -67,11 +67,9 @@ class StereoDepth:
 
     def __post_init__(self) -> None:
         shares = ("flying", "dropout", "blobs", "dark_level", "dark_dropout")
+        above_zero = min(self.baseline, self.max_disparity, self.max_distance, self.edge_step) > 0
         conditions = {
-            "baseline, max_disparity, max_distance and edge_step must be above 0": min(
-                self.baseline, self.max_disparity, self.max_distance, self.edge_step
-            )
-            > 0,
+            "baseline, max_disparity, max_distance and edge_step must be above 0": above_zero,
             "subpixel_sigma and subpixel_steps must not be negative": min(self.subpixel_sigma, self.subpixel_steps)
             >= 0,
             "window must be odd": self.window > 0 and self.window % 2 == 1,
@@ -90,8 +88,8 @@ class StereoDepth:
     def sigma(self, z: Tensor, camera: CameraModel) -> Tensor:
         """Return the standard deviation, metres, of readings of a surface at z metres: z^2 s / (fx B).
 
-        First order in the noise of the matcher, s = `subpixel_sigma` (Intel; Keselman et al. 2017), without the steps
-        of disparity and depth unit, which add s_q^2 = step^2 / 12 each.
+        First order in the noise of the matcher, s = `subpixel_sigma` (Grunnet-Jepsen, librealsense issue 3904), without
+        the steps of disparity and of depth units, each of which adds a variance of step^2 / 12.
         """
         return z * z * (self.subpixel_sigma / (camera.fx * self.baseline))
 
@@ -157,7 +155,7 @@ class StereoDepth:
         state = np.random.SeedSequence([int(seed), int(frame), _STREAM]).generate_state(1, np.uint64)
         generator = torch.Generator(device).manual_seed(int(state[0] >> np.uint64(1)))
         margin, coarse = self.window - 1, [-(-n // _PATCH) + _PATCH_WINDOW - 1 for n in (height, width)]
-        options = {"generator": generator, "device": device}
+        options: dict[str, Any] = {"generator": generator, "device": device}
         return (
             torch.randn(height + margin, width + margin, **options),
             torch.randn(*coarse, **options),

@@ -158,6 +158,27 @@ def evaluate_command(
     )  # fmt: skip
 
 
+def cloud_command(
+    depth: tyro.conf.Positional[Path],
+    camera: Path,
+    out: Path,
+    env: str = "ur3e/slide-block",
+    num_points: int = 512,
+) -> None:
+    """Turn a recorded depth image into the cloud that a policy sees, exactly as the simulator makes its own.
+
+    Args:
+        depth: a PNG of one 16-bit channel, of the camera's native size, in its depth units.
+        camera: camera file of the cell, as 'manicm-ms calibrate' writes it.
+        out: where to write the points, metres, robot-base frame: NAME.ply or NAME.npy.
+        env: environment whose workspace box crops the cloud.
+        num_points: points wanted.
+    """
+    from manicm_ms.cli.cloud import cloud
+
+    cloud(depth, camera, out, env, num_points)
+
+
 def doctor_command() -> int:
     """Say what this machine offers and lacks, each trouble with its remedy; exit status 1 where one is fatal."""
     from manicm_ms.doctor import doctor
@@ -171,6 +192,7 @@ _PLAIN: dict[str, Command] = {
     "collect": collect_command,
     "inspect": inspect_command,
     "evaluate": evaluate_command,
+    "cloud": cloud_command,
     "doctor": doctor_command,
 }
 # These depend on the preset that the command line names: its fields become options with its values as defaults.
