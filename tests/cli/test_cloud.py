@@ -1,0 +1,104 @@
+"""`manicm-ms cloud` as a user of a real camera meets it."""
+
+import cv2
+import numpy as np
+import pytest
+import torch
+import trimesh
+import yaml
+
+from manicm_ms.camera_model import default_camera, depth_to_cloud, read_camera, write_camera, write_depth
+from manicm_ms.cli import USER_ERROR, main
+from manicm_ms.paths import asset
+from manicm_ms.point_cloud import Box
+
+WORKSPACE = Box((0.15, -0.25, 0.003), (0.50, 0.25, 0.15))  # of ur3e/slide-block
+
+
+@pytest.fixture
+def recording(tmp_path):
+    """A depth image of bumps on the table, with holes, and its camera's file."""
+    camera = default_camera()
+    v, u = np.indices((camera.height, camera.width))
+    rays = np.stack([(u - camera.cx) / camera.fx, (v - camera.cy) / camera.fy, np.ones_like(u)], axis=-1)
+    height = 0.02 + 0.02 * np.sin(u / 20) * np.cos(v / 30)
+    depth = (height - camera.pose[2, 3]) / (rays @ camera.pose[2, :3])
+    depth[np.random.default_rng(0).random(depth.shape) < 0.05] = 0
+    write_depth(tmp_path / "depth.png", torch.from_numpy(depth), camera)
+    write_camera(tmp_path / "camera.yaml", camera)
+    return tmp_path
+
+
+@pytest.fixture
+def told(capsys):
+    def run(*arguments):
+        with pytest.raises(SystemExit) as end:
+            main(["cloud", *map(str, arguments)])
+        return end.value.code, *capsys.readouterr()
+
+    return run
+
+
+def expected(folder, num_points=512):
+    camera = read_camera(folder / "camera.yaml")
+    raw = cv2.imread(str(folder / "depth.png"), cv2.IMREAD_UNCHANGED)[89 : 89 + 302, 169 : 169 + 302]
+    depth = torch.from_numpy(raw.astype(np.float32) * np.float32(0.001))
+    return depth_to_cloud(depth[None], camera, WORKSPACE, num_points)[0].numpy()
+
+
+def test_the_cloud_is_that_of_the_shared_function_to_the_bit(recording, told):
+    out = recording / "cloud.npy"
+    status, said, _ = told(recording / "depth.png", "--camera", recording / "camera.yaml", "--out", out)
+    assert status == 0
+    assert "512 points, 512 of them distinct" in said
+    np.testing.assert_array_equal(np.load(out, allow_pickle=False), expected(recording))
+
+
+def test_ply_holds_the_same_points(recording, told):
+    out = recording / "cloud.ply"
+    options = ("--camera", recording / "camera.yaml", "--num-points", 100, "--env", "ur3e/slide-block")
+    assert told(recording / "depth.png", "--out", out, *options)[0] == 0
+    points = np.asarray(trimesh.load(out).vertices, np.float32)
+    np.testing.assert_array_equal(points, expected(recording, 100))
+
+
+def test_a_camera_that_looks_elsewhere_is_pointed_out(recording, told):
+    content = yaml.safe_load(asset("cameras", "d435i.yaml").read_text())
+    content["T_base_camera"][0][3] += 3.0
+    (recording / "camera.yaml").write_text(yaml.safe_dump(content))
+    options = ("--camera", recording / "camera.yaml", "--out", recording / "cloud.npy")
+    status, said, _ = told(recording / "depth.png", *options)
+    assert status == 0
+    assert "0 of them distinct" in said
+    assert "T_base_camera" in said
+    assert not np.load(recording / "cloud.npy").any()
+
+
+@pytest.mark.parametrize(
+    ("changes", "words"),
+    [
+        ({"depth": "gone.png"}, "gone.png does not exist"),
+        ({"--camera": "gone.yaml"}, "gone.yaml does not exist"),
+        ({"--env": "ur3e/slide-blok"}, "did you mean 'ur3e/slide-block'"),
+        ({"--out": "cloud.xyz"}, "ends in .ply or .npy"),
+        ({"--num-points": "0"}, "at least 1"),
+        ({"depth": "small.png"}, "small.png is 320x240 pixels"),
+        ({"depth": "colour.png"}, "3 channel(s) of uint8"),
+        ({"--camera": "other.yaml"}, "field model is 'brown_conrady'"),
+    ],
+)
+def test_errors_are_one_line_and_nothing_is_written(recording, told, monkeypatch, changes, words):
+    monkeypatch.chdir(recording)
+    cv2.imwrite("small.png", np.full((240, 320), 600, np.uint16))
+    cv2.imwrite("colour.png", np.full((480, 640, 3), 60, np.uint8))
+    content = yaml.safe_load(asset("cameras", "d435i.yaml").read_text())
+    (recording / "other.yaml").write_text(yaml.safe_dump(content | {"model": "brown_conrady"}))
+    before = sorted(recording.iterdir())
+    given = {"depth": "depth.png", "--camera": "camera.yaml", "--out": "cloud.npy"} | changes
+    depth = given.pop("depth")
+    status, _, said = told(depth, *[word for pair in given.items() for word in pair])
+    assert status == USER_ERROR
+    assert said.startswith("manicm-ms: ")
+    assert said.count("\n") == 1
+    assert words in said
+    assert sorted(recording.iterdir()) == before
