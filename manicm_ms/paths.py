@@ -107,7 +107,7 @@ def replaced_folder(path: Path) -> Iterator[Path]:
         os.replace(old, path)
     with temporary_folder(path) as fresh:
         yield fresh
-        _sync_tree(fresh)
+        sync_tree(fresh)
         if path.exists():
             shutil.rmtree(old, ignore_errors=True)
             os.replace(path, old)
@@ -219,7 +219,8 @@ def _flock(handle: int, operation: int) -> bool:
     return True
 
 
-def _sync_tree(folder: Path) -> None:
+def sync_tree(folder: Path) -> None:
+    """Force all files of a folder, and the lists of its folders, onto the disk."""
     for root, _, files in os.walk(folder):
         for name in files:
             sync(Path(root, name))

@@ -11,7 +11,7 @@ import shlex
 import sys
 from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import Any, Literal
+from typing import Annotated, Any, Literal
 
 import tyro
 
@@ -122,6 +122,38 @@ def inspect_command(
     return inspect(store, html=page, as_json=json)
 
 
+def convert_command(
+    store: tyro.conf.Positional[Path],
+    out: Path,
+    to: str | None = None,
+    from_: Annotated[str | None, tyro.conf.arg(name="from")] = None,
+    task: str | None = None,
+    env: str | None = None,
+    num_points: int | None = None,
+    colors: bool = False,
+    frame: str | None = None,
+    control_hz: float | None = None,
+) -> None:
+    """Convert a store for other tools (--to maniskill, lerobot, minari), or theirs into one (--from dp3).
+
+    Args:
+        store: what to convert.
+        out: the folder to make.
+        to: format to write.
+        from_: format to read; --out is then a store of ours.
+        task: with --to, the task in words, for formats that carry instructions.
+        env: with --from, the environment that the data is of; without it the specs are made of the shapes.
+        num_points: with --from, points kept of each cloud.
+        colors: with --from, keep rgb beside xyz.
+        frame: with --from and no --env, frame of the clouds: world (if not given) or robot_base.
+        control_hz: with --from and no --env, actions per second; 10 if not given.
+    """
+    from manicm_ms.cli.converting import convert_or_import
+
+    reading = {"env": env, "num_points": num_points, "colors": colors or None, "frame": frame, "control_hz": control_hz}
+    convert_or_import(store, out, to, from_, {"task": task}, reading)
+
+
 def evaluate_command(
     checkpoints: tyro.conf.Positional[tuple[Path, ...]],
     env: str,
@@ -191,6 +223,7 @@ _PLAIN: dict[str, Command] = {
     "check": check_command,
     "collect": collect_command,
     "inspect": inspect_command,
+    "convert": convert_command,
     "evaluate": evaluate_command,
     "cloud": cloud_command,
     "doctor": doctor_command,
