@@ -10,12 +10,13 @@ from __future__ import annotations
 import json
 import zlib
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import asdict, dataclass, fields
+from dataclasses import asdict, dataclass, fields, replace
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from manicm_ms.camera_model import CameraModel
 from manicm_ms.errors import ConfigError
 from manicm_ms.registry import Registry
 from manicm_ms.stereo_depth import StereoDepth
@@ -198,6 +199,9 @@ class RealismRows:
     def __len__(self) -> int:
         return len(self._samples)
 
+    def __contains__(self, name: str) -> bool:
+        return any(name in sample for sample in self._samples)
+
     def __getitem__(self, name: str) -> NDArray[np.float64]:
         """Return the values called `name`, (N,)."""
         neutral = 1.0 if name.endswith("_factor") else 0.0
@@ -211,6 +215,58 @@ class RealismRows:
         """Return the same with new samples in `rows`."""
         fresh = dict(zip(rows, samples, strict=True))
         return RealismRows([fresh.get(k, sample) for k, sample in enumerate(self._samples)])
+
+
+def true_cameras(camera: CameraModel, rows: RealismRows) -> list[CameraModel]:
+    """Return what the camera of each row really is, where `camera` is what its file says.
+
+    The pose moves and the cloud knows it; the intrinsics are off and the cloud does not.
+    """
+    poses = displaced(camera.pose, rows.vectors(*_axes("camera")), rows.vectors(*_axes("camera_r")))
+    focal, u, v = rows["focal_factor"], rows["centre_u"], rows["centre_v"]
+    return [
+        replace(
+            camera,
+            fx=camera.fx * focal[k],
+            fy=camera.fy * focal[k],
+            cx=camera.cx + u[k],
+            cy=camera.cy + v[k],
+            T_base_camera=tuple(map(tuple, poses[k].tolist())),
+        )
+        for k in range(len(rows))
+    ]
+
+
+def believed_poses(cameras: Sequence[CameraModel], rows: RealismRows) -> NDArray[np.float64]:
+    """Return the poses T_base_camera (N, 4, 4) that clouds are mapped with: the true ones with the extrinsic error."""
+    shift, turn = rows.vectors(*_axes("extrinsic")), rows.vectors(*_axes("extrinsic_r"))
+    errors = zip(cameras, shift, turn, strict=True)
+    return np.stack([displaced(camera.pose, s[None], t[None])[0] for camera, s, t in errors])
+
+
+def displaced(T: NDArray[np.float64], shift: NDArray[np.float64], turn: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return T (4, 4) shifted by `shift` (N, 3) m and turned about its own origin by rotation vectors (N, 3) rad.
+
+    Both in the frame that T maps to: R' = exp(turn) R, p' = p + shift. Returns (N, 4, 4).
+    """
+    moved = np.repeat(T[None], len(shift), axis=0)
+    moved[:, :3, :3] = _rotations(turn) @ T[:3, :3]
+    moved[:, :3, 3] += shift
+    return moved
+
+
+def _rotations(turn: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return the rotation matrices (N, 3, 3) of rotation vectors (N, 3) rad, by Rodrigues' formula."""
+    angle = np.linalg.norm(turn, axis=1)[:, None, None]
+    x, y, z = (turn / np.maximum(angle[:, :, 0], 1e-12)).T
+    zero = np.zeros_like(x)
+    K = np.stack([np.stack(row, axis=-1) for row in ((zero, -z, y), (z, zero, -x), (-y, x, zero))], axis=1)
+    return np.eye(3) + np.sin(angle) * K + (1 - np.cos(angle)) * (K @ K)
+
+
+def _axes(prefix: str) -> tuple[str, ...]:
+    separator = "" if prefix.endswith("_r") else "_"
+    return tuple(f"{prefix}{separator}{axis}" for axis in "xyz")
 
 
 def objects_of(spec: EnvSpec) -> tuple[str, ...]:

@@ -69,9 +69,13 @@ class SlideBlockEnv(UR3eTabletopEnv):
         xy = torch.as_tensor(rng.uniform((0.25, -0.08), (0.35, 0.08)), dtype=torch.float32)
         off = torch.as_tensor(rng.uniform(-0.005, 0.005, size=2), dtype=torch.float32)
 
-        on_table = torch.full((count, 1), CUBE_HALF + SPAWN_CLEARANCE)
+        # What a size adds to the nominal one: exactly 0 without randomised sizes, so that those starts never changed.
+        cube_extra = self.half_sizes["cube"][rows, 2:] - torch.tensor(CUBE_HALF)  # (count, 1)
+        block_extra = self.half_sizes["block"][rows, 2:] - torch.tensor(BLOCK_HALF[2])
+        on_table = torch.full((count, 1), CUBE_HALF + SPAWN_CLEARANCE) + cube_extra
         cube = Pose.create_from_pq(torch.cat([xy, on_table], dim=1), quat_from_yaw(yaw[:, 0]))
         on_cube = torch.full((count, 1), 2 * CUBE_HALF + BLOCK_HALF[2] + 2 * SPAWN_CLEARANCE)
+        on_cube = on_cube + 2 * cube_extra + block_extra
         block = Pose.create_from_pq(torch.cat([xy + off, on_cube], dim=1), quat_from_yaw(yaw.sum(dim=1)))
         self.cube.set_pose(cube)
         self.block.set_pose(block)
@@ -82,7 +86,7 @@ class SlideBlockEnv(UR3eTabletopEnv):
         block, cube = self.block.pose.raw_pose, self.cube.pose
         centre = block[:, :3]
         in_cube = pose_in_frame(block, cube.raw_pose)
-        beside = (in_cube[:, :2].abs() > CUBE_HALF).any(dim=1)
+        beside = (in_cube[:, :2].abs() > self.half_sizes["cube"][:, :2]).any(dim=1)
         fallen = (centre[:, 2] > 0) & (centre[:, 2] < FALLEN_HEIGHT) & beside
         shift, tilt = pose_error(cube, Pose.create(self.cube_start))
         moved = (shift > MAX_CUBE_SHIFT) | (tilt > MAX_CUBE_TILT)
@@ -109,7 +113,7 @@ class SlideBlockEnv(UR3eTabletopEnv):
         shift, _ = pose_error(self.cube.pose, Pose.create(self.cube_start))
         return {
             "reach": 1 - torch.tanh(5 * distance),
-            "push": (slid / (CUBE_HALF + BLOCK_HALF[0])).clamp(max=1),
+            "push": (slid / (self.half_sizes["cube"][:, 0] + self.half_sizes["block"][:, 0])).clamp(max=1),
             "fall": info["block_fallen"].float(),
             "cube_in_place": 1 - (shift / MAX_CUBE_SHIFT).clamp(max=1),
         }

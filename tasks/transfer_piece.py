@@ -146,7 +146,11 @@ def _tray() -> list[tuple[tuple[float, float, float], tuple[float, float, float]
     return [((0.0, 0.0, FLOOR / 2), (outer_x, outer_y, FLOOR / 2)), *ends, *along]
 
 
-ENVS.add(ENV_ID, EnvEntry(SPEC, partial(ManiSkillSimulator, gym_id=GYM_ID), __name__), tags=("ur3e", "real-robot"))
+ENVS.add(
+    ENV_ID,
+    EnvEntry(SPEC, partial(ManiSkillSimulator, gym_id=GYM_ID), __name__, fixed=("box",)),
+    tags=("ur3e", "real-robot"),
+)
 
 
 # ---- expert ---------------------------------------------------------------------------------------------------

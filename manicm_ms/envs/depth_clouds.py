@@ -101,7 +101,14 @@ class DepthClouds:
             T_base_camera = torch.tensor(self.camera.T_base_camera)
         self._T_base_camera[rows] = T_base_camera.to(self._T_base_camera)
 
-    def observe(self, position: Tensor, steps: Sequence[int] | Tensor, color: Tensor | None = None) -> DepthFrame:
+    def observe(
+        self,
+        position: Tensor,
+        steps: Sequence[int] | Tensor,
+        color: Tensor | None = None,
+        *,
+        lit: Tensor | None = None,
+    ) -> DepthFrame:
         """Return depth and clouds of the present pictures.
 
         Args:
@@ -109,7 +116,9 @@ class DepthClouds:
                 native resolution, and the segmentation id, 0 where nothing was hit.
             steps: (n,) control steps since each row's reset: the number of the frame, so that the noise of a frame does
                 not depend on which frames were asked for before.
-            color: (n, h, w, 3 or 4) uint8, of the same pixels; needed where `needs_color`.
+            color: (n, h, w, 3 or 4) uint8, of the same pixels, as the camera's own projector lights them; needed where
+                `needs_color`.
+            lit: (n, h, w, 3) uint8, the same under the room's light: what coloured clouds carry; None takes `color`.
         """
         hit = position[..., 3] != 0
         depth = torch.where(hit, position[..., 2] * -MICROMETRE, 0.0)
@@ -120,9 +129,10 @@ class DepthClouds:
                 depth, self.camera, self._seeds, frames,
                 intensity=None if rgb is None else rgb.mean(dim=-1), scale=self._scale,
             )  # fmt: skip
+        painted = rgb if lit is None else lit.to(torch.float32) / 255
         cloud = depth_to_cloud(
             depth, self.camera, self.workspace, self._num_points, self._size,
-            T_base_camera=self._T_base_camera, rgb=rgb if self._colors else None,
+            T_base_camera=self._T_base_camera, rgb=painted if self._colors else None,
         )  # fmt: skip
         return DepthFrame(depth, cloud)
 

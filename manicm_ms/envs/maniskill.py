@@ -16,11 +16,15 @@ vulkan.prepare()  # before SAPIEN is first imported
 
 import mani_skill.envs  # noqa: E402, F401  (registers ManiSkill's own ids)
 
-from manicm_ms.envs.cameras import CLOUD_POSITION, COLOR, MICROMETRE, cloud_shader, set_cloud_formats  # noqa: E402
-from manicm_ms.envs.simulator import Simulator, SimulatorConfig, StepResult  # noqa: E402
+from manicm_ms.camera_model import CameraModel, default_camera  # noqa: E402
+from manicm_ms.envs.cameras import CLOUD_POSITION, COLOR, cloud_shader, set_cloud_formats  # noqa: E402
+from manicm_ms.envs.delay import ActionDelay  # noqa: E402
+from manicm_ms.envs.simulator import ENVS, Simulator, SimulatorConfig, StepResult  # noqa: E402
 from manicm_ms.envs.ur3e_tabletop import UR3eTabletopEnv  # noqa: E402
-from manicm_ms.errors import RenderDeviceError  # noqa: E402
-from manicm_ms.point_cloud import crop_transformed, inside, sample_cloud, sample_cloud_batch, transform  # noqa: E402
+from manicm_ms.envs.views import CameraView, IdealView, View  # noqa: E402
+from manicm_ms.errors import ConfigError, RenderDeviceError  # noqa: E402
+from manicm_ms.realism import RealismRows  # noqa: E402
+from manicm_ms.robots.ur3e_ag95 import opening_to_action  # noqa: E402
 from manicm_ms.types import AGENT_POS, DEPTH, IMAGE, POINT_CLOUD, STATE, EnvSpec  # noqa: E402
 
 VIDEO_SHADER = "default"
@@ -43,34 +47,70 @@ class ManiSkillSimulator(Simulator):
 
     def __init__(self, spec: EnvSpec, config: SimulatorConfig, gym_id: str) -> None:
         self.spec, self.config, self.num_rows = spec, config, config.num_rows
-        self.env = _make(gym_id, spec, config)
+        self._entry = ENVS.get_registered(spec.env_id)
+        camera = config.camera or (None if config.realism.is_clean else default_camera())
+        size = config.image_size if camera is None else (camera.crop.height, camera.crop.width)
+        self.env = _make(gym_id, spec, config, camera, size)
         self.device = self.env.device
         self._camera = self.env._sensors["d435i"]
-        self._T_base_camera: Tensor | None = None  # (n, 4, 4); base and camera stand still during an episode
+        self._view: View = (
+            IdealView(self.env, config) if camera is None else CameraView(self.env, config, camera, self.device)
+        )
+        longest = config.realism.action_delay + config.realism.gripper_delay
+        self._delay = ActionDelay(self.num_rows, spec.action.dim, longest, self.device) if longest else None
+        self._values = RealismRows([{}] * self.num_rows)
+        self._steps = torch.zeros(self.num_rows, dtype=torch.int64)  # control steps since each row's reset
         self._closed = False
 
     def reset(self, rows: Tensor, seeds: Sequence[int]) -> None:
-        """See `Simulator.reset`."""
+        """See `Simulator.reset`.
+
+        Raises:
+            ConfigError: part of a batch is to be reset under a realism that builds each episode's scene anew.
+        """
+        drawn = [self._entry.conditions(self.config.realism, seed) for seed in seeds]
+        self._values = self._values.replaced(rows.tolist(), drawn)
         every = np.zeros(self.num_rows, dtype=np.int64)  # rows that are not reset never draw from their seed
         every[rows.cpu().numpy()] = np.asarray(seeds, dtype=np.int64)
         self.env.reset(seed=every.tolist(), options=self._reset_options(rows))
         self._camera = self.env._sensors["d435i"]
-        self._T_base_camera = None
+        self._view.start(rows, seeds, RealismRows(drawn))
+        self._steps[rows.cpu()] = 0
+        if self._delay is not None:
+            self._start_delay(self._delay, rows, RealismRows(drawn))
 
     def _reset_options(self, rows: Tensor) -> dict[str, Any]:
         """Return how ManiSkill is to reset `rows`: one row alone gets a fresh scene, rows of a batch cannot.
 
         PhysX keeps something of earlier contacts: in a used scene the same seed parts by millimetres from its
-        first run as soon as something is touched (docs/decisions/0010). A new scene costs 0.03 s.
+        first run as soon as something is touched (docs/decisions/0010). A new scene costs 0.03 s. Where realism
+        changes what a scene is built of, a batch gets a new one too, which only all its rows together can.
         """
-        if self.num_rows > 1:
+        builds = self.config.realism.builds
+        if self.num_rows > 1 and not builds:
             return {"env_idx": rows.to(self.device)}
+        if len(rows) < self.num_rows:
+            raise ConfigError(
+                f"{len(rows)} of {self.num_rows} rows cannot be reset alone under this realism, whose scenes are built "
+                "anew for each episode: use backend 'cpu', reset every row at once, or the preset 'd435i'"
+            )
         set_cloud_formats()
-        return {"reconfigure": True}
+        return {"reconfigure": True, "realism": self._values if builds else None}
+
+    def _start_delay(self, delay: ActionDelay, rows: Tensor, values: RealismRows) -> None:
+        """Fill the queues with what the robot does at rest: no motion, the opening that it was told last."""
+        resting = torch.zeros(len(rows), self.spec.action.dim, device=self.device)
+        resting[:, -1] = opening_to_action(self.env.agent.opening_target[rows.to(self.device)])
+        late = torch.tensor(values["action_delay"], dtype=torch.int64)[:, None].repeat(1, self.spec.action.dim)
+        late[:, -1] += torch.tensor(values["gripper_delay"], dtype=torch.int64)
+        delay.start(rows, late, resting)
 
     def step(self, actions: Tensor) -> StepResult:
         """See `Simulator.step`."""
+        if self._delay is not None:
+            actions = self._delay.push(actions)
         _, reward, terminated, _, info = self.env.step(actions)
+        self._steps += 1
         facts = {name: value for name, value in info.items() if isinstance(value, Tensor) and value.dim() == 1}
         facts.pop("elapsed_steps", None)  # the episode logic counts for itself
         return StepResult(reward.float(), terminated, facts)
@@ -87,7 +127,7 @@ class ManiSkillSimulator(Simulator):
         if STATE in wanted:
             frame[STATE] = self.env.privileged_state()
         if pictures:
-            frame |= self._render(wanted)
+            frame |= self._view.frame(wanted, self._pictures(self._view.needs_color(wanted)), self._steps)
         return frame
 
     def _shoot(self) -> None:
@@ -95,46 +135,9 @@ class ManiSkillSimulator(Simulator):
         self.env.scene.update_render(update_sensors=True, update_human_render_cameras=False)
         self._camera.capture()
 
-    def _render(self, wanted: tuple[str, ...]) -> dict[str, Tensor]:
-        pictures = self._pictures(color=IMAGE in wanted or self.config.colors)
-        position = pictures[CLOUD_POSITION]  # (n, H, W, 4) int32
-        frame: dict[str, Tensor] = {}
-        if POINT_CLOUD in wanted:
-            frame[POINT_CLOUD] = self._cloud(position, pictures[COLOR] if self.config.colors else None)
-        if DEPTH in wanted:
-            frame[DEPTH] = -position[..., 2] * MICROMETRE
-        if IMAGE in wanted:
-            frame[IMAGE] = pictures[COLOR][..., :3]
-        return frame
-
     def _pictures(self, color: bool) -> dict[str, Tensor]:
         names = [CLOUD_POSITION, COLOR] if color else [CLOUD_POSITION]
         return dict(zip(names, self._camera.camera.get_picture(names), strict=True))
-
-    def _cloud(self, position: Tensor, color: Tensor | None) -> Tensor:
-        """Return clouds (n, P, C) of camera-space positions (n, H, W, 4) int32 and rgba (n, H, W, 4) uint8."""
-        if self._T_base_camera is None:
-            T_world_camera = self._camera.camera.get_model_matrix()
-            T_base_world = self.env.agent.robot.pose.inv().to_transformation_matrix()
-            self._T_base_camera = (T_base_world @ T_world_camera).float()
-        if self.device.type == "cpu":
-            return torch.stack([self._row_cloud(k, position, color) for k in range(len(position))])
-        n = len(position)
-        xyz = transform(position[..., :3].reshape(n, -1, 3) * MICROMETRE, self._T_base_camera)
-        hit = position[..., 3].reshape(n, -1) != 0  # the background carries segmentation id 0
-        points = xyz if color is None else torch.cat([xyz, color[..., :3].reshape(n, -1, 3) / 255.0], dim=-1)
-        return sample_cloud_batch(points, hit & inside(xyz, self.env.workspace), self.config.num_points)
-
-    def _row_cloud(self, row: int, position: Tensor, color: Tensor | None) -> Tensor:
-        assert self._T_base_camera is not None
-        pixels = position[row].reshape(-1, 4).numpy()
-        hit = np.flatnonzero(pixels[:, 3])
-        xyz = pixels[hit, :3] * np.float32(MICROMETRE)
-        index, points = crop_transformed(xyz, self._T_base_camera[row].numpy(), self.env.workspace)
-        if color is not None:
-            rgb = color[row].reshape(-1, color.shape[-1])[:, :3].numpy()[hit[index]]
-            points = np.concatenate([points, rgb / np.float32(255)], axis=1)
-        return torch.from_numpy(sample_cloud(points, self.config.num_points))
 
     def render_video_frames(self) -> Tensor:
         """See `Simulator.render_video_frames`."""
@@ -147,8 +150,10 @@ class ManiSkillSimulator(Simulator):
             self.env.close()
 
 
-def _make(gym_id: str, spec: EnvSpec, config: SimulatorConfig) -> UR3eTabletopEnv:
-    height, width = config.image_size
+def _make(
+    gym_id: str, spec: EnvSpec, config: SimulatorConfig, camera: CameraModel | None, size: tuple[int, int]
+) -> UR3eTabletopEnv:
+    height, width = size
     shader = cloud_shader()
     set_cloud_formats()
     render_on_gpu = torch.cuda.is_available() and sapien_gpu.cuda_can_render()
@@ -163,6 +168,7 @@ def _make(gym_id: str, spec: EnvSpec, config: SimulatorConfig) -> UR3eTabletopEn
         # ManiSkill builds the video camera in any case: without video it shares the shader that is compiled already.
         "human_render_camera_configs": {"shader_pack": VIDEO_SHADER} if config.video else {"shader_config": shader},
         "render_mode": "rgb_array",
+        "camera_model": camera,
     }
     try:
         env = gymnasium.make(gym_id, **options)

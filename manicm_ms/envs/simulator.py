@@ -14,7 +14,9 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
+from manicm_ms.camera_model import CameraModel
 from manicm_ms.errors import ConfigError
+from manicm_ms.realism import Realism, RealismSample, objects_of
 from manicm_ms.registry import Registry
 from manicm_ms.types import AGENT_POS, OBS_KEYS, POINT_CLOUD, EnvSpec
 
@@ -48,6 +50,9 @@ class SimulatorConfig:
         video: make `render_video_frames` available (building takes some seconds longer).
         reward_mode: one of `REWARD_MODES`.
         device: "cpu", or the accelerator that simulates and renders.
+        realism: what is drawn for each episode beside the task's own randomisation.
+        camera: the depth camera of the cell with its native intrinsics; None takes the ideal camera where `realism` is
+            clean, else the D435i that the package ships.
     """
 
     num_rows: int = 1
@@ -58,6 +63,8 @@ class SimulatorConfig:
     video: bool = False
     reward_mode: str = "sparse"
     device: str = "cpu"
+    realism: Realism = Realism()  # noqa: RUF009 (it is frozen)
+    camera: CameraModel | None = None
 
     def __post_init__(self) -> None:
         unknown = [key for key in self.obs if key not in OBS_KEYS]
@@ -68,6 +75,11 @@ class SimulatorConfig:
         if self.num_rows < 1 or self.num_points < 1 or min(self.image_size) < 1:
             raise ConfigError(f"num_envs, num_points and image_size must be at least 1, got {self}")
 
+    def require_ideal(self, env_id: str) -> None:
+        """Raise ConfigError unless realism and camera are left out: for simulators that know neither."""
+        if not self.realism.is_clean or self.camera is not None:
+            raise ConfigError(f"{env_id} has no realism presets and no camera file: use realism 'clean' and no camera")
+
     def specialise(self, spec: EnvSpec) -> EnvSpec:
         """Return `spec` with the cloud and image shapes that this configuration asks for."""
         obs = replace(
@@ -77,7 +89,10 @@ class SimulatorConfig:
 
 
 class Simulator(ABC):
-    """n rows of one task. Tensors live on `device`; rows never influence each other."""
+    """n rows of one task. Tensors live on `device`; rows never influence each other.
+
+    One that does not apply `SimulatorConfig.realism` and `camera` says so by `SimulatorConfig.require_ideal`.
+    """
 
     spec: EnvSpec
     device: torch.device
@@ -112,11 +127,17 @@ class EnvEntry:
         spec: what is fixed about it.
         build: makes a simulator from the specialised spec and a configuration.
         module: dotted name of the module whose import registers it; worker processes import that one only.
+        fixed: objects of the privileged state that never move, and keep their size and mass under every realism.
     """
 
     spec: EnvSpec
     build: Callable[[EnvSpec, SimulatorConfig], Simulator]
     module: str
+    fixed: tuple[str, ...] = ()
+
+    def conditions(self, realism: Realism, seed: int) -> RealismSample:
+        """Return what `realism` draws for the episode with this seed: what the simulator applies and others record."""
+        return realism.sample(seed, objects_of(self.spec), self.fixed)
 
 
 ENVS: Registry[EnvEntry] = Registry("env id", package="manicm_ms.tasks")

@@ -17,10 +17,15 @@ from mani_skill.utils.structs import Actor, Pose
 from mani_skill.utils.structs.types import SceneConfig, SimConfig
 from torch import Tensor
 
+from manicm_ms.camera_model import CameraModel
 from manicm_ms.envs.cameras import D435I, WIDE, FixedCamera
+from manicm_ms.envs.depth_clouds import sapien_pose
+from manicm_ms.envs.row_builders import RowBuilders
+from manicm_ms.errors import ConfigError
 from manicm_ms.point_cloud import Box
+from manicm_ms.realism import RealismRows, true_cameras
 from manicm_ms.robots.limits import quat_rotate
-from manicm_ms.robots.ur3e_ag95 import UR3eAG95
+from manicm_ms.robots.ur3e_ag95 import FINGER_JOINTS, UR3eAG95
 from manicm_ms.types import ActionSpec, EnvSpec, ObsSpec
 
 CONTROL_HZ, SIM_HZ = 20, 200
@@ -67,10 +72,20 @@ def ur3e_spec(env_id: str, max_episode_steps: int, objects: tuple[str, ...]) -> 
     )
 
 
+Vector = tuple[float, float, float]
+
+
 class UR3eTabletopEnv(BaseEnv):
-    """A UR3e with an AG-95 on a table. The base stands at the origin of each row's world: world frame = base frame.
+    """A UR3e with an AG-95 on a table, whose top is z = 0 in each row's world.
+
+    The base stands at the origin, world frame = base frame, unless `reset(options={"reconfigure": True, "realism":
+    RealismRows})` draws a table height: then it stands that much lower. Tasks place and judge objects in the world;
+    what observations and privileged state tell is in the base frame.
 
     A task defines `_load_objects`, `_place_objects`, `evaluate` and `reward_terms`, and the class attributes below.
+
+    Args:
+        camera_model: a depth camera with its native intrinsics in place of `camera`.
     """
 
     SUPPORTED_ROBOTS: ClassVar[list[str]] = ["ur3e_ag95"]
@@ -88,7 +103,13 @@ class UR3eTabletopEnv(BaseEnv):
     reward_weights: ClassVar[dict[str, float]]
     """Weight of each named reward term; `reward_terms` returns the terms, each in [0, 1]."""
 
-    def __init__(self, *args: Any, robot_uids: str = "ur3e_ag95", **kwargs: Any) -> None:
+    realism: RealismRows | None = None
+    """Values that the present scene was built with; None in the ideal world."""
+
+    def __init__(
+        self, *args: Any, robot_uids: str = "ur3e_ag95", camera_model: CameraModel | None = None, **kwargs: Any
+    ) -> None:
+        self.camera_model = camera_model
         self.objects: dict[str, Actor] = {}
         self.half_sizes: dict[str, Tensor] = {}
         super().__init__(*args, robot_uids=robot_uids, **kwargs)
@@ -103,7 +124,24 @@ class UR3eTabletopEnv(BaseEnv):
 
     @property
     def _default_sensor_configs(self) -> list[CameraConfig]:
-        return [_camera_config("d435i", self.camera)]
+        if self.camera_model is None:
+            return [_camera_config("d435i", self.camera)]
+        return [self._model_config("d435i", self.camera_model)]
+
+    def _model_config(self, uid: str, camera: CameraModel) -> CameraConfig:
+        """Return the configuration of the camera's crop, with each row's true pose and intrinsics."""
+        cameras = [camera] * self.num_envs if self.realism is None else true_cameras(camera, self.realism)
+        poses = [sapien_pose(true) for true in cameras]
+        raw = torch.tensor(np.stack([np.concatenate([pose.p, pose.q]) for pose in poses]), device=self.device)
+        return CameraConfig(
+            uid,
+            pose=Pose.create(torch.cat([raw[:, :3] + self.base_position, raw[:, 3:]], dim=1)),
+            width=camera.crop.width,
+            height=camera.crop.height,
+            intrinsic=np.stack([true.crop_intrinsic for true in cameras]),
+            near=self.camera.near,
+            far=self.camera.far,
+        )
 
     @property
     def _default_human_render_camera_configs(self) -> list[CameraConfig]:
@@ -115,8 +153,27 @@ class UR3eTabletopEnv(BaseEnv):
     def _load_objects(self) -> dict[str, Actor]:
         """Build the task's objects; return them by name, in the order of the privileged state."""
 
+    def _reconfigure(self, options: dict[str, Any] | None = None) -> None:
+        self.realism = (options or {}).get("realism")
+        self.base_position = torch.zeros(self.num_envs, 3, device=self.device)  # m, of the robot's base in the world
+        if self.realism is not None:
+            self.base_position[:, 2] = torch.as_tensor(-self.realism["table_height"])
+        super()._reconfigure(options or {})
+
     def _load_agent(self, options: dict[str, Any]) -> None:
         super()._load_agent(options, sapien.Pose())
+        if self.realism is not None:
+            self._scale_gains(self.realism)
+
+    def _scale_gains(self, realism: RealismRows) -> None:
+        """Multiply the gains of each row's drives by its factors; the controllers have set them when they were made."""
+        for joint in self.agent.robot.active_joints:
+            part = "finger" if joint.name in FINGER_JOINTS else "arm"
+            stiffness, damping = realism[f"{part}_stiffness_factor"], realism[f"{part}_damping_factor"]
+            for row, drive in enumerate(joint._objs):
+                drive.set_drive_properties(
+                    drive.stiffness * stiffness[row], drive.damping * damping[row], drive.force_limit, drive.drive_mode
+                )
 
     def _load_scene(self, options: dict[str, Any]) -> None:
         self.half_sizes = {}
@@ -124,16 +181,17 @@ class UR3eTabletopEnv(BaseEnv):
         table.initial_pose = sapien.Pose(TABLE_CENTRE)
         self.table = table.build_static(name="table")
         self.objects = self._load_objects()
+        self._require_sizes()
 
     def build_box(
         self,
         name: str,
-        half_size: tuple[float, float, float],
+        half_size: Vector,
         color: tuple[float, float, float, float],
         *,
         friction: float,
         mass: float | None = None,
-    ) -> ActorBuilder:
+    ) -> ActorBuilder | RowBuilders:
         """Return a builder of a box, whose half edges (N, 3), m, then stand in `half_sizes[name]`.
 
         Args:
@@ -143,22 +201,63 @@ class UR3eTabletopEnv(BaseEnv):
             friction: material value; PhysX takes the average of the two touching materials.
             mass: kg; None for a body that never moves.
         """
-        self.half_sizes[name] = torch.tensor([half_size], device=self.device).repeat(self.num_envs, 1)
-        return self.build_boxes(name, [((0.0, 0.0, 0.0), half_size)], color, friction=friction, mass=mass)
+        centre = (0.0, 0.0, 0.0)
+        halves = np.tile(half_size, (self.num_envs, 1))
+        if self.realism is not None:
+            halves = halves * self.realism[f"{name}.size_factor"][:, None]
+        self.half_sizes[name] = torch.tensor(halves, dtype=torch.float32, device=self.device)
+        parts = [[(centre, tuple(half))] for half in halves.tolist()]
+        return self._row_builders(name, parts, color, friction, mass)
 
     def build_boxes(
         self,
         name: str,
-        parts: Sequence[tuple[tuple[float, float, float], tuple[float, float, float]]],
+        parts: Sequence[tuple[Vector, Vector]],
         color: tuple[float, float, float, float],
         *,
         friction: float,
         mass: float | None = None,
-    ) -> ActorBuilder:
+    ) -> ActorBuilder | RowBuilders:
         """Return a builder of one body made of boxes: (centre in the body's frame, half of each edge), m.
 
-        The other arguments are those of `build_box`; the mass spreads over the parts by volume.
+        The other arguments are those of `build_box`; the mass spreads over the parts by volume. Its size is the same in
+        every episode: a task that builds one names it in `EnvEntry.fixed`.
         """
+        return self._row_builders(name, [parts] * self.num_envs, color, friction, mass)
+
+    def _row_builders(
+        self,
+        name: str,
+        parts: Sequence[Sequence[tuple[Vector, Vector]]],
+        color: tuple[float, float, float, float],
+        friction: float,
+        mass: float | None,
+    ) -> ActorBuilder | RowBuilders:
+        """Return a builder with each row's own values, from the parts of each row."""
+        if self.realism is None:
+            return self._builder(name, parts[0], color, friction, mass)
+        frictions = friction * self.realism[f"{name}.friction_factor"]
+        masses = (0.0 if mass is None else mass) * self.realism[f"{name}.mass_factor"]
+        offsets = self.realism.vectors(*(f"{name}.{channel}" for channel in ("red", "green", "blue")))
+        colors = np.concatenate(
+            [(np.array(color[:3]) + offsets).clip(0, 1), np.full((len(offsets), 1), color[3])], axis=1
+        )
+        builders = [
+            self._builder(name, row_parts, row_color, row_friction, None if mass is None else row_mass)
+            for row_parts, row_color, row_friction, row_mass in zip(
+                parts, colors.tolist(), frictions.tolist(), masses.tolist(), strict=True
+            )
+        ]
+        return builders[0] if len(builders) == 1 else RowBuilders(self.scene, builders)
+
+    def _builder(
+        self,
+        name: str,
+        parts: Sequence[tuple[Vector, Vector]],
+        color: Sequence[float],
+        friction: float,
+        mass: float | None,
+    ) -> ActorBuilder:
         builder = self.scene.create_actor_builder()
         builder.set_name(name)
         material = sapien.physx.PhysxMaterial(friction, friction, 0.0)
@@ -172,6 +271,14 @@ class UR3eTabletopEnv(BaseEnv):
         # Far apart, so that nothing overlaps before the first episode places it.
         builder.initial_pose = sapien.Pose((0.3, 0.1 * len(self.scene.actors), 0.5))
         return builder
+
+    def _require_sizes(self) -> None:
+        """Raise ConfigError where a size was drawn for an object that takes none."""
+        for name in self.objects:
+            if name not in self.half_sizes and self.realism is not None and f"{name}.size_factor" in self.realism:
+                raise ConfigError(
+                    f"{name} is not built by build_box, so its size cannot vary: name it in EnvEntry.fixed"
+                )
 
     # ---- episode ----------------------------------------------------------------------------------------------
 
@@ -191,7 +298,7 @@ class UR3eTabletopEnv(BaseEnv):
             arm = torch.tensor(np.asarray(self.start_qpos) + noise, dtype=torch.float32)  # (count, 6)
             fingers = torch.full((count, 2), self.start_opening / 2)
             self.agent.reset(torch.cat([arm, fingers], dim=1))
-            self.agent.robot.set_pose(sapien.Pose())
+            self.agent.robot.set_pose(Pose.create_from_pq(self.base_position[env_idx]))
             self._place_objects(rng, count)
 
     # ---- observation ------------------------------------------------------------------------------------------
@@ -204,7 +311,7 @@ class UR3eTabletopEnv(BaseEnv):
 
     def privileged_state(self) -> Tensor:
         """Return what experts and critics may know (N, S), laid out as the spec's `state_layout` says."""
-        poses = [actor.pose.raw_pose for actor in self.objects.values()]
+        poses = [self._at_base(actor) for actor in self.objects.values()]
         robot = self.agent
         own = [robot.tcp_pose_at_base, robot.tcp_target_pose, robot.opening[:, None], robot.arm_qpos, robot.arm_qvel]
         return torch.cat(own + poses, dim=1)
@@ -212,8 +319,13 @@ class UR3eTabletopEnv(BaseEnv):
     def _get_obs_extra(self, info: dict[str, Any]) -> dict[str, Tensor]:
         extra = {"tcp_pose": self.agent.tcp_pose_at_base, "opening": self.agent.opening}
         if self.obs_mode_struct.use_state:
-            extra |= {f"{name}_pose": actor.pose.raw_pose for name, actor in self.objects.items()}
+            extra |= {f"{name}_pose": self._at_base(actor) for name, actor in self.objects.items()}
         return extra
+
+    def _at_base(self, actor: Actor) -> Tensor:
+        """Return poses in the base frame (N, 7); the base is never turned."""
+        world = actor.pose.raw_pose
+        return torch.cat([world[:, :3] - self.base_position, world[:, 3:]], dim=1)
 
     # ---- reward -----------------------------------------------------------------------------------------------
 

@@ -8,6 +8,7 @@ import os
 from abc import abstractmethod
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
+from pathlib import Path
 from typing import Any
 
 import gymnasium
@@ -20,10 +21,12 @@ from numpy.typing import ArrayLike
 from torch import Tensor
 
 from manicm_ms import sapien_gpu
+from manicm_ms.camera_model import CameraModel, read_camera
 from manicm_ms.envs.chunk import ActionChunk
 from manicm_ms.envs.simulator import ENVS, EnvEntry, SimulatorConfig
 from manicm_ms.envs.worker import FACTS, RowEnv, action_space, observation_space
 from manicm_ms.errors import ActionError, BackendError, ConfigError, ManicmError
+from manicm_ms.realism import Realism, resolve_realism
 from manicm_ms.types import AGENT_POS, POINT_CLOUD, ChunkSpec, EnvSpec
 
 BACKENDS = ("auto", "cpu", "gpu")
@@ -300,6 +303,8 @@ def make_vec(
     image_size: tuple[int, int] = (84, 84),
     video: bool = False,
     reward_mode: str = "sparse",
+    realism: str | Realism = "clean",
+    camera: CameraModel | Path | str | None = None,
 ) -> VecEnv:
     """Make N parallel rows of a registered environment.
 
@@ -315,9 +320,12 @@ def make_vec(
         image_size: (H, W) of the camera, pixels.
         video: make `render_video_frames` available; building takes some seconds longer.
         reward_mode: "sparse", "normalized_dense", "dense" or "none".
+        realism: "clean", "d435i", "d435i+dr", or ranges of your own: what is drawn for each episode from its seed.
+        camera: the cell's depth camera, or its YAML file as `manicm-ms calibrate` writes it; None takes the ideal one
+            where realism is clean, else the D435i that the package ships.
 
     Raises:
-        UnknownNameError, ConfigError, BackendError, RenderDeviceError.
+        UnknownNameError, ConfigError, CameraError, BackendError, RenderDeviceError.
     """
     entry = ENVS.get(env_id)
     backend = resolve_backend(backend)
@@ -330,6 +338,8 @@ def make_vec(
         video=video,
         reward_mode=reward_mode,
         device="cpu" if backend == "cpu" else "cuda",
+        realism=resolve_realism(realism),
+        camera=read_camera(Path(camera)) if isinstance(camera, (str, Path)) else camera,
     )
     if num_envs < 1:
         raise ConfigError(f"num_envs must be at least 1, got {num_envs}")
