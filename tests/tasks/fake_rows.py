@@ -1,14 +1,33 @@
-"""Fakes that let the batched task code run on N rows without a simulator: no GPU is at hand, and a CPU scene has one.
+"""A fake that lets the batched code of any task run on N rows without a simulator: a CPU scene has but one row.
 
 The fakes keep ManiSkill's rule: a setter writes the rows of `scene._reset_mask`, and takes one value for each of them.
+What the task itself does, from `_load_objects` to `reward_terms`, is the task's own code, and so is the test of a grasp
+(`UR3eAG95.is_grasping`); only bodies, joints and contact forces are made up here.
 """
-
-from types import SimpleNamespace
 
 import torch
 from mani_skill.envs.utils.randomization.batched_rng import BatchedRNG
 from mani_skill.utils.structs import Pose
-from manicm_ms.tasks.slide_block import SlideBlockEnv
+
+from manicm_ms.robots.ur3e_ag95 import UR3eAG95
+
+
+class FakeScene:
+    """Which rows are being reset, and which forces (N, 3) act between two bodies."""
+
+    def __init__(self, n):
+        self._reset_mask = torch.ones(n, dtype=torch.bool)
+        self.forces = {}
+
+    def get_pairwise_contact_forces(self, first, second):
+        return self.forces.get((first, second), torch.zeros(len(self._reset_mask), 3))
+
+    def write(self, rows, values):
+        """Write `values` into the rows being reset, one for each of them."""
+        mask = self._reset_mask
+        if len(values) != int(mask.sum()):
+            raise AssertionError(f"{len(values)} values for {int(mask.sum())} rows being reset")
+        rows[mask] = values.to(rows.dtype)
 
 
 class FakeActor:
@@ -23,54 +42,66 @@ class FakeActor:
         return Pose.create(self.raw.clone())
 
     def set_pose(self, pose):
-        mask = self._scene._reset_mask
-        if pose.raw_pose.shape[0] != int(mask.sum()):
-            raise AssertionError(f"{len(pose.raw_pose)} poses for {int(mask.sum())} rows being reset")
-        self.raw[mask] = pose.raw_pose.to(self.raw.dtype)
+        self._scene.write(self.raw, pose.raw_pose)
 
     def is_static(self, lin_thresh, ang_thresh):
         return (self.linear_velocity.norm(dim=1) <= lin_thresh) & (self.angular_velocity.norm(dim=1) <= ang_thresh)
 
 
-class FakeRobot:
+class FakeBuilder:
     def __init__(self, scene, n):
-        self._scene = scene
+        self.build = self.build_kinematic = self.build_static = lambda name: FakeActor(scene, n)
+
+
+class FakeRobot:
+    def __init__(self, n):
         self.qpos = torch.zeros(n, 8)
-        self.root = FakeActor(scene, n)
         self.set_pose = lambda pose: None  # the base never moves
+        self.get_qpos = lambda: self.qpos
 
 
 class FakeAgent:
+    _finger_columns = (6, 7)
+    device = torch.device("cpu")
+    opening = UR3eAG95.opening
+    pad_forces = UR3eAG95.pad_forces
+    is_grasping = UR3eAG95.is_grasping
+
     def __init__(self, scene, n):
-        self._scene, self.robot = scene, FakeRobot(scene, n)
-        self.tcp = torch.zeros(n, 7)
-        self.tcp[:, 3] = 1.0
+        self.scene, self.robot = scene, FakeRobot(n)
+        self.tcp, self.left_finger, self.right_finger = (FakeActor(scene, n) for _ in range(3))
 
     def reset(self, qpos):
-        mask = self._scene._reset_mask
-        if qpos.shape[0] != int(mask.sum()):
-            raise AssertionError(f"{len(qpos)} joint vectors for {int(mask.sum())} rows being reset")
-        self.robot.qpos[mask] = qpos
+        self.scene.write(self.robot.qpos, qpos)
 
     @property
     def tcp_pose(self):
-        return Pose.create(self.tcp.clone())
+        return self.tcp.pose
 
 
-class FakeSlideBlock:
-    """The task's own methods, unbound, on N fake rows."""
+class FakeTask:
+    """N rows of a task: everything that is not made up here is looked up in the environment class and bound to this."""
 
-    start_qpos, start_opening = SlideBlockEnv.start_qpos, SlideBlockEnv.start_opening
-    reward_weights = SlideBlockEnv.reward_weights
     device = torch.device("cpu")
 
-    def __init__(self, n):
-        self.num_envs = n
-        self.scene = SimpleNamespace(_reset_mask=torch.ones(n, dtype=torch.bool))
-        self.cube, self.block = FakeActor(self.scene, n), FakeActor(self.scene, n)
+    def __init__(self, env_class, n):
+        self._env_class, self.num_envs = env_class, n
+        self.scene = FakeScene(n)
         self.agent = FakeAgent(self.scene, n)
-        self.cube_start = self.cube.raw.clone()
+        self.half_sizes, self.base_position = {}, torch.zeros(n, 3)
+        self.objects = self._load_objects()
         self._batched_episode_rng = BatchedRNG.from_seeds([0] * n)
+
+    def __getattr__(self, name):
+        found = getattr(object.__getattribute__(self, "_env_class"), name)
+        return found.__get__(self) if hasattr(found, "__get__") else found
+
+    def build_box(self, name, half_size, color, *, friction, mass=None):
+        self.half_sizes[name] = torch.tensor([half_size]).repeat(self.num_envs, 1)
+        return FakeBuilder(self.scene, self.num_envs)
+
+    def build_boxes(self, name, parts, color, *, friction, mass=None):
+        return FakeBuilder(self.scene, self.num_envs)
 
     def reset(self, rows, seeds):
         """Reset `rows` with `seeds`, as ManiSkill does for `options={"env_idx": rows}`."""
@@ -81,12 +112,55 @@ class FakeSlideBlock:
         self._initialize_episode(rows, {})
         self.scene._reset_mask[:] = True
 
-    def tensors(self):
-        return [self.cube.raw, self.block.raw, self.cube_start, self.agent.robot.qpos]
+    def hold(self, name, newtons, row=0):
+        """Let both pads press on an object, each with `newtons` along its own opening direction."""
+        for finger in (self.agent.left_finger, self.agent.right_finger):
+            self.press(finger, name, (newtons, 0.0, 0.0), row)
 
-    _initialize_episode = SlideBlockEnv._initialize_episode
-    _place_objects = SlideBlockEnv._place_objects
-    evaluate = SlideBlockEnv.evaluate
-    reward_terms = SlideBlockEnv.reward_terms
-    compute_dense_reward = SlideBlockEnv.compute_dense_reward
-    compute_normalized_dense_reward = SlideBlockEnv.compute_normalized_dense_reward
+    def press(self, finger, name, force, row=0):
+        """Let an object press on a finger with a force (3,) N."""
+        key = (finger, self.objects[name])
+        self.scene.forces.setdefault(key, torch.zeros(self.num_envs, 3))[row] = torch.tensor(force)
+
+    def tensors(self):
+        """Return everything that rows keep, by name, (N, ...) each; writing into them changes the rows."""
+        bodies = self.objects | {part: getattr(self.agent, part) for part in ("tcp", "left_finger", "right_finger")}
+        kept = {name: value for name, value in vars(self).items() if isinstance(value, torch.Tensor)}
+        kept |= {f"{name} size": value for name, value in self.half_sizes.items()}
+        for name, body in bodies.items():
+            kept |= {f"{name} pose": body.raw, f"{name} v": body.linear_velocity, f"{name} w": body.angular_velocity}
+        for thing, actor in self.objects.items():
+            for side, finger in (("left", self.agent.left_finger), ("right", self.agent.right_finger)):
+                force = self.scene.forces.setdefault((finger, actor), torch.zeros(self.num_envs, 3))
+                kept[f"{thing} on {side}"] = force
+        return kept | {"qpos": self.agent.robot.qpos}
+
+    def single(self, row):
+        """Return a one-row copy of a row."""
+        one = FakeTask(self._env_class, 1)
+        mine = self.tensors()
+        for name, value in one.tensors().items():
+            value.copy_(mine[name][row : row + 1])
+        return one
+
+
+def fresh(env_class, n, first_seed=0):
+    """Return N rows at the start of the episodes first_seed, first_seed + 1, ..."""
+    env = FakeTask(env_class, n)
+    env.reset(range(n), range(first_seed, first_seed + n))
+    return env
+
+
+def flags(env, untouched):
+    """Return the names of the facts that hold in row 0; the other rows must show exactly those of `untouched`."""
+    facts = {name: values.tolist() for name, values in env.evaluate().items()}
+    for name, values in facts.items():
+        assert values[1:] == [name in untouched] * (env.num_envs - 1), f"{name} of the untouched rows"
+    return {name for name, values in facts.items() if values[0]}
+
+
+def turned(angle, axis):
+    """Return the quaternion wxyz of a rotation by `angle` rad about a coordinate axis (0, 1, 2)."""
+    q = torch.zeros(4)
+    q[0], q[1 + axis] = torch.cos(torch.tensor(angle / 2)), torch.sin(torch.tensor(angle / 2))
+    return q
