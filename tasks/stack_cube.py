@@ -138,7 +138,7 @@ ENVS.add(ENV_ID, EnvEntry(SPEC, partial(ManiSkillSimulator, gym_id=GYM_ID), __na
 GRASP_OPENING, RELEASE_OPENING = 0.080, 0.066  # m
 HOVER_Z, GRASP_Z, LIFT_Z, OVER_Z, PLACE_Z, RETREAT_Z = 0.083, 0.023, 0.136, 0.106, 0.076, 0.146  # m, TCP
 FREE_SPEED, LOWER_SPEED, LIFT_SPEED, PLACE_SPEED = 0.22, 0.12, 0.15, 0.08  # m/s
-GRIP_STEPS = 9  # control steps for the fingers to close or open
+CLOSE_STEPS, OPEN_STEPS = 6, 4  # control steps that the fingers need; from longer pauses a policy learns to stay
 
 
 @EXPERTS.register(ENV_ID)
@@ -175,11 +175,11 @@ class StackCubeExpert:
         way = [
             (over(red, HOVER_Z), grasp, GRASP_OPENING, FREE_SPEED, 0),
             (over(red, GRASP_Z), grasp, GRASP_OPENING, LOWER_SPEED, 0),
-            (over(red, GRASP_Z), grasp, 0.0, LOWER_SPEED, GRIP_STEPS),
+            (over(red, GRASP_Z), grasp, 0.0, LOWER_SPEED, CLOSE_STEPS),
             (over(red, LIFT_Z), grasp, 0.0, LIFT_SPEED, 0),
             (over(white, OVER_Z), grasp, 0.0, FREE_SPEED, 0),
             (over(white, PLACE_Z), grasp, 0.0, PLACE_SPEED, 0),
-            (over(white, PLACE_Z), grasp, RELEASE_OPENING, PLACE_SPEED, GRIP_STEPS),
+            (over(white, PLACE_Z), grasp, RELEASE_OPENING, PLACE_SPEED, OPEN_STEPS),
             (over(white, RETREAT_Z), grasp, RELEASE_OPENING, LIFT_SPEED, 0),
         ]
         self._follower.reset(waypoint_table(way, red), mask)

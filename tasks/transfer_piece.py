@@ -158,7 +158,7 @@ ENVS.add(
 INSERT_OPENING, RELEASE_OPENING = 0.050, 0.045  # m: the fully open gripper does not fit between the walls
 HOVER_Z, GRASP_Z, CARRY_Z, PLACE_Z, RETREAT_Z = 0.095, 0.025, 0.085, 0.028, 0.105  # m, TCP
 FREE_SPEED, LOWER_SPEED, LIFT_SPEED, PLACE_SPEED = 0.22, 0.12, 0.15, 0.10  # m/s
-GRIP_STEPS = 8  # control steps for the fingers to close or open
+CLOSE_STEPS, OPEN_STEPS = 4, 3  # control steps that the fingers need; from longer pauses a policy learns to stay
 
 
 @EXPERTS.register(ENV_ID)
@@ -198,11 +198,11 @@ class TransferPieceExpert:
         way = [
             (at(piece, HOVER_Z), grasp, INSERT_OPENING, FREE_SPEED, 0),
             (at(piece, GRASP_Z), grasp, INSERT_OPENING, LOWER_SPEED, 0),
-            (at(piece, GRASP_Z), grasp, 0.0, LOWER_SPEED, GRIP_STEPS),
+            (at(piece, GRASP_Z), grasp, 0.0, LOWER_SPEED, CLOSE_STEPS),
             (at(piece, CARRY_Z), grasp, 0.0, LIFT_SPEED, 0),
             (at(right, CARRY_Z), place, 0.0, FREE_SPEED, 0),
             (at(right, PLACE_Z), place, 0.0, PLACE_SPEED, 0),
-            (at(right, PLACE_Z), place, RELEASE_OPENING, PLACE_SPEED, GRIP_STEPS),
+            (at(right, PLACE_Z), place, RELEASE_OPENING, PLACE_SPEED, OPEN_STEPS),
             (at(right, RETREAT_Z), place, RELEASE_OPENING, LIFT_SPEED, 0),
         ]
         self._follower.reset(waypoint_table(way, piece), mask)
