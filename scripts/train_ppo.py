@@ -39,22 +39,21 @@ from manicm_ms.evaluation.statistics import wilson_interval
 from manicm_ms.paths import write_json
 from manicm_ms.provenance import package_versions
 from manicm_ms.training.interrupt import StopRequest, stop_requests
-from manicm_ms.types import STATE
+from manicm_ms.types import STATE, ChunkSpec
 
 PICTURE = Path(__file__).resolve().parents[1] / "docs" / "images" / "ppo_slide_block.png"
 CURVE, WEIGHTS, RESULT = "curve.json", "policy.safetensors", "result.json"
 TRAINING_SEEDS = 1_000_000  # training of seed s plays episodes from (s + 1) times this; what is judged starts at 0
 FINAL_SEEDS = 10_000  # first seed of the episodes that judge the trained policy; those of the curve start at 0
 
-GAMMA = 0.96  # 25 control steps: the dense reward leads the way, the rest is variance
+HELD = 4  # control steps that an action is held: five decisions a second explore further than twenty
+GAMMA = 0.9  # per decision: ten of them, two seconds; the dense reward leads the way
 PPO_SETTINGS: dict[str, Any] = {
-    "n_steps": 512,  # per row and update
+    "n_steps": 128,  # decisions of each row between updates
     "batch_size": 64,
     "n_epochs": 10,
     "learning_rate": 5e-4,
-    "gae_lambda": 0.95,
     "gamma": GAMMA,
-    "target_kl": 0.05,
 }
 NETWORK: dict[str, Any] = {"net_arch": [128, 128], "log_std_init": -0.7}
 CLIP_OBS, STD_FLOOR = 10.0, 1e-8  # of normalised observations; VecNormalize's own epsilon
@@ -78,11 +77,11 @@ class Train:
 
     env: str = "ur3e/slide-block"
     seed: int = 0
-    steps: int = 250_000
+    steps: int = 100_000
     rows: int = 2
-    eval_every: int = 10_000
-    eval_episodes: int = 20
-    final_episodes: int = 100
+    eval_every: int = 8_000
+    eval_episodes: int = 10
+    final_episodes: int = 50
     minutes: float | None = None
     out: Path | None = None
 
@@ -179,6 +178,25 @@ class PpoPlayer:
         return torch.from_numpy(action)
 
 
+class Held:
+    """Lets a player decide at every `HELD`-th control step, as PPO does in training, and hold the action between."""
+
+    def __init__(self, player: Player) -> None:
+        self._player, self._played, self._action = player, 0, torch.empty(0)
+
+    def begin(self, state: Tensor, seeds: Sequence[int]) -> None:
+        """See `Player.begin`."""
+        self._played = 0
+        self._player.begin(state, seeds)
+
+    def act(self, state: Tensor) -> Tensor:
+        """See `Player.act`."""
+        if self._played % HELD == 0:
+            self._action = self._player.act(state)
+        self._played += 1
+        return self._action
+
+
 def save_policy(path: Path, model: PPO, normal: VecNormalize) -> None:
     """Write a policy's weights and the statistics of its observations."""
     fresh = path.with_suffix(".part")
@@ -267,7 +285,7 @@ class CurveCallback(BaseCallback):
     def _evaluate(self) -> None:
         """Add a point to the curve, and write curve and weights."""
         save_policy(self._out / WEIGHTS, self.model, self._normal)  # type: ignore[arg-type]  # made by `train`
-        score = play(self._judge, load_player(self._out / WEIGHTS, self._judge), range(self._args.eval_episodes))
+        score = play(self._judge, Held(load_player(self._out / WEIGHTS, self._judge)), range(self._args.eval_episodes))
         minutes = (time.monotonic() - self._began) / 60
         self._points.append({"steps": self.num_timesteps, "minutes": round(minutes, 2), **asdict(score)})
         write_json(self._out / CURVE, self._points)
@@ -283,8 +301,10 @@ def train(args: Train) -> None:
     if out.exists():
         raise ConfigError(f"{out} exists: choose another --out, or remove it")
     out.mkdir(parents=True)
+    held = ChunkSpec(horizon=HELD, n_obs_steps=1, n_action_steps=HELD)
     training, judge = (
-        make_vec(args.env, args.rows, "cpu", obs=(STATE,), reward_mode="normalized_dense") for _ in range(2)
+        make_vec(args.env, args.rows, "cpu", obs=(STATE,), chunk=chunk, reward_mode="normalized_dense")
+        for chunk in (held, None)
     )
     try:
         with stop_requests() as stop:
@@ -302,7 +322,7 @@ def train(args: Train) -> None:
 
 def _learn(args: Train, out: Path, training: VecEnv, judge: VecEnv, stop: StopRequest) -> tuple[float, int]:
     """Run PPO; return the minutes that it took, judging included, and the control steps played."""
-    rows = AbsorbingSuccess(VecMonitor(StableBaselinesEnv(training)), GAMMA)
+    rows = AbsorbingSuccess(VecMonitor(StableBaselinesEnv(training)), GAMMA, largest=HELD)
     # Rewards are scaled by the spread of the discounted return, and not clipped: a success is far from the others.
     normal = VecNormalize(rows, clip_obs=CLIP_OBS, clip_reward=np.inf, gamma=GAMMA, epsilon=STD_FLOOR)
     model = PPO("MlpPolicy", normal, seed=args.seed, device="cpu", policy_kwargs=NETWORK, **PPO_SETTINGS)
@@ -314,8 +334,8 @@ def _learn(args: Train, out: Path, training: VecEnv, judge: VecEnv, stop: StopRe
 
 def _judge_all(args: Train, out: Path, judge: VecEnv) -> dict[str, dict[str, Any]]:
     players: dict[str, Player] = {
-        "ppo": load_player(out / WEIGHTS, judge),
-        "random actions": RandomPlayer(judge.env_spec.action.dim, args.seed),
+        "ppo": Held(load_player(out / WEIGHTS, judge)),
+        "random actions": Held(RandomPlayer(judge.env_spec.action.dim, args.seed)),
         "idle": IdlePlayer(judge.env_spec.action.dim),
         "expert": ExpertPlayer(judge),
     }

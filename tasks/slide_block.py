@@ -102,7 +102,7 @@ class SlideBlockEnv(UR3eTabletopEnv):
         }
 
     def reward_terms(self, info: dict[str, Tensor]) -> dict[str, Tensor]:
-        """Return the named terms, each (N,) in [0, 1].
+        """Return the named terms, each (N,) in [0, 1]; what a later stage leaves behind stays earned.
 
         reach: the TCP comes near the block. push: the block leaves the cube's centre, full at the cube's edge.
         fall: the block lies beside the cube. cube_in_place: the cube stays where it was.
@@ -111,10 +111,11 @@ class SlideBlockEnv(UR3eTabletopEnv):
         distance = (self.agent.tcp_pose.p - block).norm(dim=1)
         slid = (block - cube)[:, :2].norm(dim=1)
         shift, _ = pose_error(self.cube.pose, Pose.create(self.cube_start))
+        fallen = info["block_fallen"].float()
         return {
-            "reach": 1 - torch.tanh(5 * distance),
+            "reach": torch.maximum(1 - torch.tanh(5 * distance), fallen),
             "push": (slid / (self.half_sizes["cube"][:, 0] + self.half_sizes["block"][:, 0])).clamp(max=1),
-            "fall": info["block_fallen"].float(),
+            "fall": fallen,
             "cube_in_place": 1 - (shift / MAX_CUBE_SHIFT).clamp(max=1),
         }
 

@@ -6,7 +6,6 @@ from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
-from gymnasium import spaces
 from numpy.typing import NDArray
 from stable_baselines3.common.vec_env import VecEnv as StableVecEnv
 from stable_baselines3.common.vec_env import VecEnvWrapper
@@ -14,6 +13,7 @@ from stable_baselines3.common.vec_env.base_vec_env import VecEnvIndices, VecEnvO
 from torch import Tensor
 
 from manicm_ms.envs.vec_env import VecEnv
+from manicm_ms.envs.worker import action_space, observation_space
 from manicm_ms.errors import ConfigError
 from manicm_ms.seeds import require_seed
 
@@ -29,6 +29,9 @@ class StableBaselinesEnv(StableVecEnv):
     (the frame that the episode ended with; what `step` returns is the next episode's first), `TimeLimit.truncated`
     (bootstrap from that frame: the time was up, the task was not over) and `is_success`.
 
+    An environment with a `ChunkSpec` plays each action for the chunk's Ta control steps, so that a learner decides at a
+    lower rate than the controller runs; rewards are summed over them, and of the history the last frame is returned.
+
     Args:
         env: the environment; an observation of one key becomes a plain array, of several a dictionary.
         seed: of the first episode.
@@ -42,12 +45,12 @@ class StableBaselinesEnv(StableVecEnv):
         self.env = env
         self._next_seed = seed
         self._keys = tuple(env.single_observation_space)  # type: ignore[arg-type]  # a Dict space
-        self._actions = np.zeros(env.action_space.shape or (), np.float32)
+        self._held = env.chunk.n_action_steps if env.chunk else 1
+        spaces_of_rows = observation_space(env.env_spec, self._keys, None)
+        self._actions = np.zeros((env.num_envs, env.env_spec.action.dim), np.float32)
         self.render_mode: str | None = None  # Stable-Baselines3 asks for it before it sets it
-        single = env.single_observation_space
-        assert isinstance(single, spaces.Dict)
-        space = single[self._keys[0]] if len(self._keys) == 1 else single
-        super().__init__(env.num_envs, space, env.single_action_space)
+        space = spaces_of_rows[self._keys[0]] if len(self._keys) == 1 else spaces_of_rows
+        super().__init__(env.num_envs, space, action_space(env.env_spec, None))
 
     def seed(self, seed: int | None = None) -> Sequence[int | None]:
         """Let the next episode have `seed` (a random one where it is None); return the seeds that the rows get."""
@@ -67,7 +70,8 @@ class StableBaselinesEnv(StableVecEnv):
 
     def step_wait(self) -> VecEnvStepReturn:
         """Play the actions; return observations, rewards (N,), dones (N,) and N dictionaries."""
-        obs, reward, terminated, truncated, info = self.env.step(self._actions)
+        chunk = np.repeat(self._actions[:, None], self._held, axis=1)  # (N, Ta, Da)
+        obs, reward, terminated, truncated, info = self.env.step(chunk if self.env.chunk else self._actions)
         ended = _array(terminated | truncated)
         infos = [self._row_info(k, obs, truncated, info) if ended[k] else {} for k in range(self.num_envs)]
         after = self._start(ended) if ended.any() else self._arrays(obs)
@@ -102,12 +106,13 @@ class StableBaselinesEnv(StableVecEnv):
         return self._arrays(obs)
 
     def _row_info(self, row: int, obs: dict[str, Tensor], truncated: Tensor, info: dict[str, Any]) -> dict[str, Any]:
-        last = self._arrays({key: values[row] for key, values in obs.items()})
+        frames = self._arrays(obs)
+        last = {key: values[row] for key, values in frames.items()} if isinstance(frames, dict) else frames[row]
         facts = {"terminal_observation": last, "TimeLimit.truncated": bool(truncated[row])}
         return facts | {SUCCESS: bool(info["success_once"][row]), "error": info["error"][row]}
 
     def _arrays(self, obs: dict[str, Tensor]) -> Any:
-        arrays = {key: _array(values) for key, values in obs.items()}
+        arrays = {key: _array(values[:, -1] if self.env.chunk else values) for key, values in obs.items()}
         return arrays[self._keys[0]] if len(self._keys) == 1 else arrays
 
 
@@ -116,22 +121,23 @@ class AbsorbingSuccess(VecEnvWrapper):
 
     Dense rewards are positive and highest in success. Where success ends an episode and nothing follows, a learner
     that maximises their sum does best by staying just short of it. So success counts as an absorbing state that goes
-    on to earn the reward r of its first step: r + gamma r + gamma^2 r + ... = r / (1 - gamma) takes r's place.
-    Failures, crashes among them, stay worth nothing from then on: with rewards of 0 and more, no state is worse.
+    on to earn the largest reward r: gamma r + gamma^2 r + ... = gamma r / (1 - gamma) is added to its first reward.
+    Failures, crashes among them, earn nothing from then on: with rewards of 0 and more, no state is worse.
 
     Args:
-        venv: gives `is_success` in the info of the last step, and r in [0, 1].
-        gamma: the learner's discount, in [0, 1).
+        venv: gives `is_success` in the info of the last step.
+        gamma: the learner's discount for one of its decisions, in [0, 1).
+        largest: r, the largest reward of one decision: for normalised rewards the control steps that it lasts.
 
     Raises:
         ConfigError: a discount outside [0, 1).
     """
 
-    def __init__(self, venv: StableVecEnv, gamma: float) -> None:
+    def __init__(self, venv: StableVecEnv, gamma: float, largest: float = 1.0) -> None:
         if not 0 <= gamma < 1:
             raise ConfigError(f"gamma must lie in [0, 1), got {gamma}: with 1 a success would be worth infinitely much")
         super().__init__(venv)
-        self.gamma = gamma
+        self._for_ever = gamma * largest / (1 - gamma)
 
     def reset(self) -> VecEnvObs:
         """See `StableBaselinesEnv.reset`."""
@@ -142,7 +148,7 @@ class AbsorbingSuccess(VecEnvWrapper):
         obs, rewards, dones, infos = self.venv.step_wait()
         ends = zip(dones, infos, strict=True)
         absorbed = np.array([done and info[SUCCESS] and not info["TimeLimit.truncated"] for done, info in ends])
-        return obs, np.where(absorbed, rewards / (1 - self.gamma), rewards).astype(np.float32), dones, infos
+        return obs, (rewards + self._for_ever * absorbed).astype(np.float32), dones, infos
 
 
 def normalized_return(rewards: Tensor, steps: Tensor, success: Tensor, max_episode_steps: int) -> Tensor:
