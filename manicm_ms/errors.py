@@ -17,10 +17,12 @@ class ManicmError(Exception):
 class UnknownNameError(ManicmError):
     """A name that no registry entry answers to."""
 
-    def __init__(self, kind: str, asked: str, known: Iterable[str]) -> None:
+    def __init__(self, kind: str, asked: str, known: Iterable[str], present_name: str | None = None) -> None:
         names = sorted(known)
         near = difflib.get_close_matches(asked, names, n=1, cutoff=0.4)
         hint = f"did you mean {near[0]!r}? " if near else ""
+        if present_name is not None:
+            hint = f"it is called {present_name!r} here; "
         super().__init__(f"unknown {kind} {asked!r}: {hint}known: {', '.join(names) or 'none'}")
         self.kind, self.asked, self.known = kind, asked, names
 
@@ -61,7 +63,7 @@ class NoSpaceError(ManicmError):
 
 
 class RenderDeviceError(ManicmError):
-    """No Vulkan device that SAPIEN can render with."""
+    """No Vulkan device that SAPIEN, or no OpenGL that MuJoCo, can render with."""
 
 
 class BackendError(ManicmError):

@@ -26,13 +26,22 @@ class Registry(Generic[T]):
         self._package = package
         self._entries: dict[str, T] = {}
         self._tags: dict[str, frozenset[str]] = {}
+        self._former: dict[str, str] = {}
 
-    def add(self, name: str, entry: T, tags: Iterable[str] = ()) -> T:
-        """Enter `entry` under `name`; raise DuplicateNameError where the name is taken."""
+    def add(self, name: str, entry: T, tags: Iterable[str] = (), former: Iterable[str] = ()) -> T:
+        """Enter `entry` under `name`; raise DuplicateNameError where the name is taken.
+
+        Args:
+            name: what it is looked up by.
+            entry: what is registered.
+            tags: groups that it belongs to.
+            former: names that it has, or had, elsewhere; asking for one of them is answered by `name`.
+        """
         if name in self._entries:
             raise DuplicateNameError(self.kind, name)
         self._entries[name] = entry
         self._tags[name] = frozenset(tags)
+        self._former.update(dict.fromkeys(former, name))
         return entry
 
     def register(self, name: str, tags: Iterable[str] = ()) -> Callable[[Any], Any]:
@@ -51,7 +60,7 @@ class Registry(Generic[T]):
     def get_registered(self, name: str) -> T:
         """Return the entry called `name` among those registered so far, without importing anything else."""
         if name not in self._entries:
-            raise UnknownNameError(self.kind, name, self._entries)
+            raise UnknownNameError(self.kind, name, self._entries, self._former.get(name))
         return self._entries[name]
 
     def names(self, tag: str | None = None) -> tuple[str, ...]:

@@ -27,7 +27,10 @@ ACTION = "action"
 
 OBS_KEYS = (POINT_CLOUD, AGENT_POS, IMAGE, DEPTH, STATE)
 
-FRAMES = ("robot_base", "world")
+WORLD_FRAME = "world"
+DP3_FRAME = "dp3"
+"""That of the public DP3 wrapper's clouds, which is neither the world nor the camera (`envs.mujoco_task.Dp3Frame`)."""
+FRAMES = ("robot_base", WORLD_FRAME, DP3_FRAME)
 
 
 @dataclass(frozen=True)

@@ -22,19 +22,21 @@ ALLOWED = {
     **{name: set() for name in BASE},
     "__init__": {"envs"},  # lazily: make_vec and check_vec_env
     "assets": set(),
+    "calibration": set(),
     "vulkan": set(),
     "sapien_gpu": {"vulkan"},
+    "mujoco_gl": set(),
     "robots": {"vulkan"},
-    "envs": {"robots", "tasks", "vulkan", "sapien_gpu"},
+    "envs": {"robots", "tasks", "vulkan", "sapien_gpu", "mujoco_gl"},
     "tasks": {"envs", "robots", "demos", "vulkan"},
     "demos": {"envs", "tasks"},
     "policies": set(),
     "training": {"demos", "policies"},
     "evaluation": {"envs", "policies"},
     "deploy": {"policies"},
-    "doctor": {"vulkan", "sapien_gpu"},
+    "doctor": {"vulkan", "sapien_gpu", "mujoco_gl"},
 }
-MAY_SIMULATE = {"robots", "envs", "tasks", "vulkan", "sapien_gpu"}
+MAY_SIMULATE = {"robots", "envs", "tasks", "vulkan", "sapien_gpu", "mujoco_gl"}
 UNBOUND = {"cli"}  # the command line: may import everything, nobody imports it
 
 

@@ -18,8 +18,10 @@ from manicm_ms.camera_model import CameraModel
 from manicm_ms.errors import ConfigError
 from manicm_ms.realism import Realism, RealismSample, objects_of
 from manicm_ms.registry import Registry
-from manicm_ms.types import AGENT_POS, OBS_KEYS, POINT_CLOUD, EnvSpec
+from manicm_ms.types import AGENT_POS, DP3_FRAME, OBS_KEYS, POINT_CLOUD, EnvSpec
 
+OBS_PRESETS = ("manicm_ms", "dp3")
+"""How observations are made: the package's own way, and that of the public DP3 wrapper (Adroit and Meta-World)."""
 REWARD_MODES = ("sparse", "dense", "normalized_dense", "none")
 
 
@@ -50,6 +52,7 @@ class SimulatorConfig:
         video: make `render_video_frames` available (building takes some seconds longer).
         reward_mode: one of `REWARD_MODES`.
         device: "cpu", or the accelerator that simulates and renders.
+        obs_preset: one of `OBS_PRESETS`; an environment's entry says which of them it has.
         realism: what is drawn for each episode beside the task's own randomisation.
         camera: the depth camera of the cell with its native intrinsics; None takes the ideal camera where `realism` is
             clean, else the D435i that the package ships.
@@ -63,6 +66,7 @@ class SimulatorConfig:
     video: bool = False
     reward_mode: str = "sparse"
     device: str = "cpu"
+    obs_preset: str = "manicm_ms"
     realism: Realism = Realism()  # noqa: RUF009 (it is frozen)
     camera: CameraModel | None = None
 
@@ -72,6 +76,8 @@ class SimulatorConfig:
             raise ConfigError(f"unknown observation keys {unknown}: choose from {', '.join(OBS_KEYS)}")
         if self.reward_mode not in REWARD_MODES:
             raise ConfigError(f"unknown reward_mode {self.reward_mode!r}: choose from {', '.join(REWARD_MODES)}")
+        if self.obs_preset not in OBS_PRESETS:
+            raise ConfigError(f"unknown obs_preset {self.obs_preset!r}: choose from {', '.join(OBS_PRESETS)}")
         if self.num_rows < 1 or self.num_points < 1 or min(self.image_size) < 1:
             raise ConfigError(f"num_envs, num_points and image_size must be at least 1, got {self}")
 
@@ -85,6 +91,8 @@ class SimulatorConfig:
         obs = replace(
             spec.obs, num_points=self.num_points, point_channels=6 if self.colors else 3, image_size=self.image_size
         )
+        if self.obs_preset == "dp3":  # its clouds are in a frame of their own, agent_pos is not
+            return replace(spec, obs=replace(obs, frame=DP3_FRAME), tcp_indices=None)
         return replace(spec, obs=obs)
 
 
@@ -128,12 +136,27 @@ class EnvEntry:
         build: makes a simulator from the specialised spec and a configuration.
         module: dotted name of the module whose import registers it; worker processes import that one only.
         fixed: objects of the privileged state that never move, and keep their size and mass under every realism.
+        backends: where it can be simulated: "cpu", "gpu" or both.
+        obs_presets: those of `OBS_PRESETS` that it has.
+        has_realism: whether it knows realism presets and camera files.
     """
 
     spec: EnvSpec
     build: Callable[[EnvSpec, SimulatorConfig], Simulator]
     module: str
     fixed: tuple[str, ...] = ()
+    backends: tuple[str, ...] = ("cpu", "gpu")
+    obs_presets: tuple[str, ...] = ("manicm_ms",)
+    has_realism: bool = True
+
+    def require(self, config: SimulatorConfig) -> None:
+        """Raise ConfigError where `config` asks for what this environment does not have."""
+        if config.obs_preset not in self.obs_presets:
+            raise ConfigError(
+                f"{self.spec.env_id} has no obs_preset {config.obs_preset!r}: use {' or '.join(self.obs_presets)}"
+            )
+        if not self.has_realism:
+            config.require_ideal(self.spec.env_id)
 
     def conditions(self, realism: Realism, seed: int) -> RealismSample:
         """Return what `realism` draws for the episode with this seed: what the simulator applies and others record."""

@@ -305,6 +305,7 @@ def make_vec(
     reward_mode: str = "sparse",
     realism: str | Realism = "clean",
     camera: CameraModel | Path | str | None = None,
+    obs_preset: str = "manicm_ms",
 ) -> VecEnv:
     """Make N parallel rows of a registered environment.
 
@@ -323,12 +324,13 @@ def make_vec(
         realism: "clean", "d435i", "d435i+dr", or ranges of your own: what is drawn for each episode from its seed.
         camera: the cell's depth camera, or its YAML file as `manicm-ms calibrate` writes it; None takes the ideal one
             where realism is clean, else the D435i that the package ships.
+        obs_preset: "manicm_ms", or "dp3" for clouds as the public DP3 wrapper makes them (Adroit and Meta-World).
 
     Raises:
         UnknownNameError, ConfigError, CameraError, BackendError, RenderDeviceError.
     """
     entry = ENVS.get(env_id)
-    backend = resolve_backend(backend)
+    backend = resolve_backend(backend, entry)
     config = SimulatorConfig(
         num_rows=1 if backend == "cpu" else num_envs,
         obs=tuple(obs),
@@ -340,17 +342,26 @@ def make_vec(
         device="cpu" if backend == "cpu" else "cuda",
         realism=resolve_realism(realism),
         camera=read_camera(Path(camera)) if isinstance(camera, (str, Path)) else camera,
+        obs_preset=obs_preset,
     )
+    entry.require(config)
     if num_envs < 1:
         raise ConfigError(f"num_envs must be at least 1, got {num_envs}")
     vec_env = CpuVecEnv if backend == "cpu" else GpuVecEnv
     return vec_env(entry, config.specialise(entry.spec), num_envs, config, chunk)
 
 
-def resolve_backend(backend: str) -> str:
-    """Return "cpu" or "gpu" for one of `BACKENDS`; raise BackendError where it cannot run here."""
+def resolve_backend(backend: str, entry: EnvEntry | None = None) -> str:
+    """Return "cpu" or "gpu" for one of `BACKENDS`; raise BackendError where it cannot run here.
+
+    An environment (`entry`) that only has the cpu backend gets it under "auto".
+    """
     if backend not in BACKENDS:
         raise BackendError(f"unknown backend {backend!r}: choose from {', '.join(BACKENDS)}")
+    if entry is not None and "gpu" not in entry.backends:
+        if backend == "gpu":
+            raise BackendError(f"{entry.spec.env_id} has no gpu backend, its physics run on the CPU: use backend='cpu'")
+        return "cpu"
     missing = _gpu_obstacle()
     if backend == "gpu" and missing:
         raise BackendError(f"backend 'gpu' cannot run here: {missing}; use backend 'cpu'")

@@ -1,0 +1,122 @@
+"""OpenGL without a screen, for MuJoCo: chooses EGL or OSMesa before mujoco is imported, and tries it.
+
+MuJoCo reads MUJOCO_GL while it is imported and, left alone, takes GLFW, which needs a screen. `prepare` sets it to the
+first that this machine has: EGL (a GPU's, or Mesa's software renderer), else OSMesa, else "disabled": physics then
+works and rendering raises RenderDeviceError. A choice that the user made stays.
+"""
+
+from __future__ import annotations
+
+import ctypes
+import importlib
+import os
+import subprocess
+import sys
+from dataclasses import dataclass
+from typing import Any
+
+from manicm_ms.errors import RenderDeviceError
+
+VARIABLE = "MUJOCO_GL"
+DISABLED = "disabled"
+CHOICES = ("egl", "osmesa", "glfw", DISABLED)
+REMEDY = "run 'make setup FORCE=1' in the repository, or as root 'apt install libegl1 libgl1' (or libosmesa6)"
+
+_CONTEXTS = {"egl": "mujoco.egl", "osmesa": "mujoco.osmesa", "glfw": "mujoco.glfw"}
+_LIBRARIES = {"egl": ("libEGL.so.1",), "osmesa": ("libOSMesa.so.8", "libOSMesa.so.6")}
+_TRIAL = "manicm_ms.envs.mujoco_render"  # run as a module, it renders one tiny picture
+_EGL_PLATFORM_DEVICE = 0x313F
+_MOST_DEVICES = 32
+
+
+@dataclass(frozen=True)
+class Probe:
+    """Outcome of a trial rendering.
+
+    Attributes:
+        works: whether MuJoCo rendered a correct depth image.
+        device: the OpenGL renderer's name and how it was reached, empty where it does not work.
+        reason: one line saying what went wrong, empty where it works.
+    """
+
+    works: bool
+    device: str = ""
+    reason: str = ""
+
+
+def prepare() -> str:
+    """Choose how MuJoCo renders in this process and its children, and return it: one of `CHOICES`.
+
+    Call it before mujoco is first imported. Calling twice is fine.
+
+    Raises RenderDeviceError where MUJOCO_GL names something else, or a library that is not here.
+    """
+    # Threads of Mesa's rasteriser do not survive a fork, and are no faster at the size of an observation.
+    os.environ.setdefault("LP_NUM_THREADS", "0")
+    named = os.environ.get(VARIABLE, "").strip().lower()
+    if named and named not in CHOICES:
+        raise RenderDeviceError(f"{VARIABLE}={named} is none of {', '.join(CHOICES)}: unset it, or name one of them")
+    if named in _LIBRARIES and not _library(*_LIBRARIES[named]):
+        raise RenderDeviceError(f"{VARIABLE}={named}, but {_LIBRARIES[named][0]} is not here: unset it; {REMEDY}")
+    if not named:
+        named = "egl" if _egl_initialises() else "osmesa" if _library(*_LIBRARIES["osmesa"]) else DISABLED
+        os.environ[VARIABLE] = named
+    return named
+
+
+def make_context(width: int, height: int) -> Any:
+    """Return a GL context of MuJoCo's own, not yet current, for pictures of up to `width` x `height` pixels.
+
+    Raises RenderDeviceError where there is none to be had.
+    """
+    choice = prepare()
+    if choice == DISABLED:
+        raise RenderDeviceError(f"no OpenGL to render with: neither EGL nor OSMesa is here; {REMEDY}")
+    try:
+        return importlib.import_module(_CONTEXTS[choice]).GLContext(width, height)
+    except Exception as error:  # PyOpenGL's and the driver's own kinds; what follows is the same for all
+        lines = str(error).strip().splitlines() or [type(error).__name__]
+        raise RenderDeviceError(f"MuJoCo cannot render through {choice} ({lines[0]}); {REMEDY}") from error
+
+
+def probe(timeout_s: float = 120) -> Probe:
+    """Render a tiny scene in a process of its own: a driver may crash, and what it loads stays out of this one."""
+    try:
+        done = subprocess.run(
+            [sys.executable, "-m", _TRIAL], capture_output=True, text=True, timeout=timeout_s, check=False
+        )
+    except subprocess.TimeoutExpired:
+        return Probe(False, reason=f"no picture within {timeout_s:.0f} s")
+    lines = (done.stdout if done.returncode == 0 else done.stderr).strip().splitlines()
+    last = lines[-1] if lines else f"the trial rendering ended with status {done.returncode}"
+    return Probe(True, device=last) if done.returncode == 0 else Probe(False, reason=last)
+
+
+def _library(*names: str) -> ctypes.CDLL | None:
+    for name in names:
+        try:
+            return ctypes.CDLL(name)
+        except OSError:
+            continue
+    return None
+
+
+def _egl_initialises() -> bool:
+    """Return whether some EGL device opens without a screen, asked the way MuJoCo does."""
+    egl = _library(*_LIBRARIES["egl"])
+    if egl is None:
+        return False
+    egl.eglGetProcAddress.restype = ctypes.c_void_p
+    pointer = ctypes.c_void_p
+    addresses = [egl.eglGetProcAddress(name) for name in (b"eglQueryDevicesEXT", b"eglGetPlatformDisplayEXT")]
+    if not all(addresses):
+        return False
+    query_type = ctypes.CFUNCTYPE(ctypes.c_uint, ctypes.c_int, ctypes.POINTER(pointer), ctypes.POINTER(ctypes.c_int))
+    display_type = ctypes.CFUNCTYPE(pointer, ctypes.c_uint, pointer, pointer)
+    query, display_of = query_type(addresses[0]), display_type(addresses[1])
+    egl.eglInitialize.argtypes = (pointer, pointer, pointer)
+    devices, count = (pointer * _MOST_DEVICES)(), ctypes.c_int()
+    if not query(_MOST_DEVICES, devices, ctypes.byref(count)):
+        return False
+    displays = (display_of(_EGL_PLATFORM_DEVICE, device, None) for device in devices[: count.value])
+    return any(display and egl.eglInitialize(display, None, None) for display in displays)
