@@ -1,5 +1,9 @@
 """`manicm-ms cloud` as a user of a real camera meets it."""
 
+import re
+from dataclasses import replace
+from pathlib import Path
+
 import cv2
 import numpy as np
 import pytest
@@ -9,8 +13,12 @@ import yaml
 
 from manicm_ms.camera_model import default_camera, depth_to_cloud, read_camera, write_camera, write_depth
 from manicm_ms.cli import USER_ERROR, main
+from manicm_ms.envs.simulator import ENVS
+from manicm_ms.envs.vec_env import make_vec
 from manicm_ms.paths import asset
 from manicm_ms.point_cloud import Box
+from manicm_ms.realism import REALISM, RealismRows, believed_poses, true_cameras
+from manicm_ms.types import DEPTH, POINT_CLOUD
 
 WORKSPACE = Box((0.15, -0.25, 0.003), (0.50, 0.25, 0.15))  # of ur3e/slide-block
 
@@ -102,3 +110,61 @@ def test_errors_are_one_line_and_nothing_is_written(recording, told, monkeypatch
     assert said.count("\n") == 1
     assert words in said
     assert sorted(recording.iterdir()) == before
+
+
+# ---- the same cloud as the simulator's
+
+ENV_ID, SEED = "ur3e/slide-block", 11
+
+
+def observed(key, image_size):
+    """What the simulated D435i gives under `key` after ten steps of an episode: (h, w) or (P, 3)."""
+    env = make_vec(ENV_ID, 1, backend="cpu", obs=(key,), image_size=image_size, realism="d435i")
+    try:
+        env.reset(seed=[SEED])
+        push = torch.tensor([[0.3, -0.5, -1.0, 0.0, 0.0, 0.2, 0.0]])
+        for _ in range(10):
+            obs, *_ = env.step(push)
+        return obs[key][0]
+    finally:
+        env.close()
+
+
+def test_the_simulators_cloud_comes_out_of_its_recorded_depth_to_the_bit(tmp_path, told):
+    camera = default_camera()
+    left, top, width, height = camera.crop
+    recorded = torch.zeros(camera.height, camera.width)
+    recorded[top : top + height, left : left + width] = observed(DEPTH, (height, width))
+    write_depth(tmp_path / "depth.png", recorded, camera)
+    # The driver's calibration is wrong in this episode, and its camera file says so.
+    values = RealismRows([ENVS.get(ENV_ID).conditions(REALISM.get("d435i"), SEED)])
+    pose = believed_poses(true_cameras(camera, values), values)[0]
+    assert 1e-3 < np.abs(pose - camera.pose).max() < 2e-2
+    write_camera(tmp_path / "camera.yaml", replace(camera, T_base_camera=tuple(map(tuple, pose.tolist()))))
+    out = tmp_path / "cloud.npy"
+    assert told(tmp_path / "depth.png", "--camera", tmp_path / "camera.yaml", "--out", out, "--env", ENV_ID)[0] == 0
+    cloud = observed(POINT_CLOUD, (84, 84)).numpy()
+    assert len(np.unique(cloud, axis=0)) > 200
+    np.testing.assert_array_equal(np.load(out), cloud)
+
+
+# ---- the guide
+
+
+def blocks(language):
+    guide = (Path(__file__).resolve().parents[2] / "docs/guides/real_camera.md").read_text()
+    return re.findall(rf"```{language}\n(.*?)```", guide, flags=re.DOTALL)
+
+
+def test_the_guides_camera_file_is_the_shipped_one(tmp_path):
+    (tmp_path / "camera.yaml").write_text(blocks("yaml")[0])
+    assert read_camera(tmp_path / "camera.yaml") == default_camera()
+
+
+def test_the_guides_loop_runs(tmp_path, monkeypatch):
+    write_camera(tmp_path / "camera.yaml", default_camera())
+    monkeypatch.chdir(tmp_path)
+    names = {}
+    exec(next(block for block in blocks("python") if "depth_to_cloud" in block), names)
+    assert names["cloud"].shape == (1, 512, 3)
+    assert names["cloud"].any()
