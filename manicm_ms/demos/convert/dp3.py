@@ -202,13 +202,14 @@ def _episode(raw: _RawStore, spec: EnvSpec, number: int, start: int, stop: int, 
     clouds = raw.read("point_cloud", start, stop).astype(np.float32)[..., : 6 if spec.obs.point_channels == 6 else 3]
     if spec.obs.point_channels == 6 and clouds[..., 3:].max() > 1:  # 0 to 255, as the simulators of DP3 give them
         clouds[..., 3:] /= 255
+    extras: dict[str, Any] = {name: raw.read(name, start, stop) for name in pictures}
     return Episode(
         point_cloud=np.stack([_resampled(cloud, spec.obs.num_points) for cloud in clouds]),
         agent_pos=raw.read("agent_pos", start, stop).astype(np.float32),
         action=action.clip(-1, 1),
         seed=-1 - number,
         success=True,
-        **{name: raw.read(name, start, stop) for name in pictures},
+        **extras,
     )
 
 

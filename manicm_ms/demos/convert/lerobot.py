@@ -1,26 +1,23 @@
 """To a LeRobotDataset (format v3.0), written by lerobot's own class in an interpreter of lerobot's own.
 
-lerobot pins an older torch than ours, so the two share no environment: `lerobot_writer.py` runs in that of lerobot and
-takes the episodes through a pipe.
+lerobot pins an older torch than ours, so the two share no environment.
 """
 
 from __future__ import annotations
 
-import json
 import os
 import subprocess
 import sys
-import tempfile
 from pathlib import Path
-from typing import IO, Any
+from typing import Any
 
 import numpy as np
 
-from manicm_ms.demos.convert import lerobot_writer
 from manicm_ms.demos.convert.base import EXPORTERS, SIDECAR, Export, MissingDependencyError, Tally
+from manicm_ms.demos.convert.writer import Writer
 from manicm_ms.demos.store import Episode, frame_shapes
-from manicm_ms.errors import ConfigError, ManicmError, NoSpaceError
-from manicm_ms.paths import is_disk_full, write_json
+from manicm_ms.errors import ConfigError
+from manicm_ms.paths import write_json
 from manicm_ms.types import EnvSpec
 
 PYTHON_VARIABLE = "MANICM_MS_LEROBOT_PYTHON"
@@ -50,7 +47,7 @@ def export(job: Export) -> Tally:
     if spec.action.control_hz != int(spec.action.control_hz):
         raise ConfigError(f"LeRobot's fps is a whole number, {spec.env_id} runs at {spec.action.control_hz} Hz")
     job.require_space()
-    header = {
+    description = {
         "repo_id": f"manicm_ms/{job.out.name}",
         "fps": int(spec.action.control_hz),
         "robot_type": spec.env_id.partition("/")[0],
@@ -58,8 +55,7 @@ def export(job: Export) -> Tally:
         "task": job.task,
     }
     tally = Tally()
-    with _Writer(python, job.folder) as writer:
-        writer.send({"job": np.array(json.dumps(header))})
+    with Writer("lerobot", python, job.folder, description) as writer:
         for episode in job.episodes():
             writer.send(_frames(episode, job.store.fields))
             tally.add(episode)
@@ -115,52 +111,3 @@ def _frames(episode: Episode, fields: tuple[str, ...]) -> dict[str, np.ndarray]:
     last = np.zeros((len(episode), 1), bool)
     last[-1] = True
     return {KEYS[name]: getattr(episode, name) for name in fields} | {SUCCESS: last & episode.success, DONE: last}
-
-
-class _Writer:
-    """The process that writes, while the block lasts; leaving the block without an error waits for its end."""
-
-    def __init__(self, python: str, root: Path) -> None:
-        self._said: IO[bytes] = tempfile.TemporaryFile()  # noqa: SIM115  (__exit__ closes it; a full pipe would stop the process)
-        # -I: nothing of our environment, nor this folder, whose lerobot.py would stand before the library.
-        self._process = subprocess.Popen(
-            [python, "-I", lerobot_writer.__file__, str(root)],
-            stdin=subprocess.PIPE,
-            stdout=self._said,
-            stderr=self._said,
-            env={**os.environ, "HF_HUB_OFFLINE": "1"},
-        )
-
-    def send(self, arrays: dict[str, np.ndarray]) -> None:
-        assert self._process.stdin is not None
-        try:
-            self._process.stdin.write(lerobot_writer.pack(arrays))
-            self._process.stdin.flush()
-        except BrokenPipeError as error:
-            raise self._failure() from error
-
-    def __enter__(self) -> _Writer:
-        return self
-
-    def __exit__(self, kind: type[BaseException] | None, *_: object) -> None:
-        try:
-            if kind is not None:
-                self._process.kill()
-                self._process.communicate()
-            elif self._end():
-                raise self._failure()
-        finally:
-            self._said.close()
-
-    def _end(self) -> int:
-        self._process.communicate()  # closes its input
-        return self._process.returncode
-
-    def _failure(self) -> ManicmError:
-        self._process.wait()
-        self._said.seek(0)
-        lines = self._said.read().decode(errors="replace").strip().splitlines()
-        reason = lines[-1].strip() if lines else f"exit status {self._process.returncode}"
-        if is_disk_full(Exception(reason)):
-            return NoSpaceError(f"lerobot found no space left ({reason}): free some and give the same command")
-        return ManicmError(f"lerobot could not write the data set ({reason}): check its installation")

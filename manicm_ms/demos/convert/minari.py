@@ -8,20 +8,19 @@ from __future__ import annotations
 
 import os
 import re
+import sys
 from importlib.util import find_spec
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
-import gymnasium
 import numpy as np
 
 from manicm_ms.demos.convert.base import EXPORTERS, SIDECAR, Export, MissingDependencyError, Tally
+from manicm_ms.demos.convert.writer import Writer
 from manicm_ms.demos.store import Episode, frame_shapes
 from manicm_ms.errors import ConfigError
 from manicm_ms.paths import write_json
-
-if TYPE_CHECKING:
-    from minari.data_collector import EpisodeBuffer
+from manicm_ms.types import EnvSpec
 
 _NAME = re.compile(r"[-_\w]+-v\d+")
 REMEDY = "pip install 'manicm_ms[minari]'"
@@ -35,74 +34,55 @@ def export(job: Export) -> Tally:
     """
     if find_spec("minari") is None:
         raise MissingDependencyError("minari", "minari", REMEDY)
-    from minari import MinariDataset, __version__
-    from minari.dataset.minari_storage import MinariStorage
-
-    dataset_id = _dataset_id(job.out)
-    job.require_space()
-    (job.folder / "data").mkdir(parents=True)
     spec, provenance = job.store.spec, job.store.provenance
-    storage = MinariStorage.new(
-        job.folder / "data",
-        observation_space=observation_space(job),
-        action_space=gymnasium.spaces.Box(-1.0, 1.0, (spec.action.dim,), np.float32),
-        jpeg_encoding=False,
-    )
-    storage.update_metadata(
-        {
-            "dataset_id": dataset_id,
-            "minari_version": __version__,
-            "algorithm_name": f"{provenance.get('expert')}, {provenance.get('style')}",
-            "description": f"{job.task} ({spec.env_id}); the last observation of an episode stands there twice",
-        }
-    )
+    metadata = {
+        "dataset_id": _dataset_id(job.out),
+        "algorithm_name": f"{provenance.get('expert')}, {provenance.get('style')}",
+        "description": f"{job.task} ({spec.env_id}); the last observation of an episode stands there twice",
+    }
+    job.require_space()
     tally = Tally(notes=["the last observation of each episode is repeated, rewards are sparse"])
-    for number, episode in enumerate(job.episodes()):
-        storage.update_episodes([_buffer(episode, job.store.fields)])
-        storage.update_episode_metadata([{"success": episode.success}], [number])
-        tally.add(episode)
+    description = {"metadata": metadata, "spaces": spaces(spec, job.store.fields)}
+    with Writer("minari", sys.executable, job.folder, description) as writer:
+        for episode in job.episodes():
+            writer.send(_arrays(episode, job.store.fields))
+            tally.add(episode)
     write_json(job.folder / SIDECAR, job.about())
-    assert MinariDataset(storage).total_steps == tally.frames
     return tally
 
 
-def observation_space(job: Export) -> gymnasium.spaces.Dict:
-    """Return the space of what the store holds of a frame: its fields without the action."""
-    boxes: dict[str, gymnasium.Space[Any]] = {}
-    shapes = frame_shapes(job.store.spec)
-    for name in job.store.fields:
-        shape, dtype = shapes[name]
-        if name == "action":
-            continue
-        low, high = (0, 255) if dtype == np.uint8 else (-np.inf, np.inf)
-        boxes[name] = gymnasium.spaces.Box(low, high, shape, dtype.type)
-    return gymnasium.spaces.Dict(boxes)
+def spaces(spec: EnvSpec, fields: tuple[str, ...]) -> dict[str, Any]:
+    """Return (low, high, shape, type) of a frame of each field."""
+    bounds = {"action": (-1.0, 1.0), "image": (0, 255)}
+    return {
+        name: (*bounds.get(name, (-np.inf, np.inf)), shape, dtype.name)
+        for name, (shape, dtype) in frame_shapes(spec).items()
+        if name in fields
+    }
 
 
-def _buffer(episode: Episode, fields: tuple[str, ...]) -> EpisodeBuffer:
-    from minari.data_collector import EpisodeBuffer
-
-    frames = {name: getattr(episode, name) for name in fields if name != "action"}
+def _arrays(episode: Episode, fields: tuple[str, ...]) -> dict[str, Any]:
     ends = np.zeros(len(episode), bool)
     ends[-1] = True
-    return EpisodeBuffer(
-        seed=episode.seed if episode.seed >= 0 else None,
-        observations={name: np.concatenate([values, values[-1:]]) for name, values in frames.items()},  # (L + 1, ...)
-        actions=episode.action,
-        rewards=(ends & episode.success).astype(np.float32),
-        terminations=ends & episode.success,
-        truncations=ends & (not episode.success),
-        infos={},
-    )
+    frames = {name: getattr(episode, name) for name in fields}
+    seen = {name: np.concatenate([v, v[-1:]]) for name, v in frames.items() if name != "action"}  # (L + 1, ...)
+    return {
+        **seen,
+        "action": episode.action,
+        "reward": (ends & episode.success).astype(np.float32),
+        "termination": ends & episode.success,
+        "truncation": ends & (not episode.success),
+        "seed": episode.seed,
+        "success": episode.success,
+    }
 
 
 def _dataset_id(out: Path) -> str:
     """Return the id that Minari will know `out` by: its path below Minari's folder, elsewhere its name."""
     root = Path(os.environ.get("MINARI_DATASETS_PATH") or Path.home() / ".minari" / "datasets").absolute()
     out = out.absolute()
-    dataset_id = out.relative_to(root).as_posix() if out.is_relative_to(root) else out.name
     if not _NAME.fullmatch(out.name):
         raise ConfigError(
             f"{out.name!r} is no id of a Minari data set: let --out end in a name with a version, like slide-block-v0"
         )
-    return dataset_id
+    return out.relative_to(root).as_posix() if out.is_relative_to(root) else out.name
