@@ -308,6 +308,11 @@ REALISM.add(
 )
 
 
+def realism_name(realism: Realism) -> str:
+    """Return the name of the preset with these ranges, "custom" where there is none."""
+    return next((name for name in REALISM.names() if REALISM.get(name) == realism), "custom")
+
+
 def resolve_realism(realism: str | Realism) -> Realism:
     """Return the preset of this name, or what is already a `Realism`; raise UnknownNameError with the nearest name."""
     return realism if isinstance(realism, Realism) else REALISM.get(realism)

@@ -80,6 +80,8 @@ def collect_command(
     backend: Backend = "auto",
     colors: bool = False,
     extras: tuple[str, ...] = (),
+    realism: str = "clean",
+    camera: Path | None = None,
 ) -> None:
     """Collect demonstrations of the task's expert into a store, in parallel; the same command goes on after a kill.
 
@@ -93,13 +95,15 @@ def collect_command(
         backend: where to simulate.
         colors: store rgb beside xyz.
         extras: optional fields to store: image, depth, privileged_state.
+        realism: clean, d435i or d435i+dr: camera errors and physical values drawn for each episode.
+        camera: YAML file of the cell's depth camera, as 'manicm-ms calibrate' writes it.
     """
     from manicm_ms.demos.collect import collect
     from manicm_ms.envs.vec_env import default_num_envs
 
     done = collect(
         env_id, episodes, out, num_envs=num_envs or default_num_envs(), seed=seed, style=style, backend=backend,
-        colors=colors, extras=extras,
+        colors=colors, extras=extras, realism=realism, camera=camera,
     )  # fmt: skip
     print(f"{done.path}: {done.episodes} episodes from {done.attempts} attempts, {done.added} of them new")
 
@@ -211,6 +215,73 @@ def cloud_command(
     cloud(depth, camera, out, env, num_points)
 
 
+def calibrate_command(
+    images: tyro.conf.Positional[Path],
+    out: Path,
+    poses: Path | None = None,
+    intrinsics: Path | None = None,
+    squares: tuple[int, int] = (5, 7),
+    square_length: float = 0.030,
+    marker_length: float = 0.022,
+    dictionary: str = "4X4_50",
+    legacy: bool = False,
+    overwrite: bool = False,
+) -> None:
+    """Solve the pose of a fixed camera from images of a ChArUco board in the robot's hand; write the camera file.
+
+    Args:
+        images: folder of PNG or JPG images, all of one stream.
+        out: camera file to write (YAML), for the tasks, 'manicm-ms cloud' and a real camera.
+        poses: robot poses of the images, JSON or CSV; by default poses.json or poses.csv in the folder.
+        intrinsics: camera file whose intrinsics hold; without it they are solved from the board.
+        squares: squares in a row and in a column of the board.
+        square_length: side of a square, metres, as measured on the print.
+        marker_length: side of a marker, metres.
+        dictionary: OpenCV's marker dictionary.
+        legacy: the board was made by OpenCV before 4.6.
+        overwrite: replace the camera file where there is one.
+    """
+    from rich.console import Console
+
+    from manicm_ms.calibration import CharucoSpec, calibrate
+    from manicm_ms.cli.calibration import progress, report
+
+    board = CharucoSpec(*squares, square_length, marker_length, dictionary, legacy)
+    with progress() as on_image:
+        solved = calibrate(
+            images, board, out, poses=poses, intrinsics=intrinsics, overwrite=overwrite, on_image=on_image
+        )
+    report(solved, Console())
+    print(f"{out} written")
+
+
+def board_command(
+    out: Path = Path("board.pdf"),
+    squares: tuple[int, int] = (5, 7),
+    square_length: float = 0.030,
+    marker_length: float = 0.022,
+    dictionary: str = "4X4_50",
+    legacy: bool = False,
+    overwrite: bool = False,
+) -> None:
+    """Draw a ChArUco board for calibrate at its exact size, to be printed at 100 %.
+
+    Args:
+        out: NAME.pdf, NAME.svg or NAME.png.
+        squares: squares in a row and in a column.
+        square_length: side of a square, metres.
+        marker_length: side of a marker, metres.
+        dictionary: OpenCV's marker dictionary.
+        legacy: the pattern of OpenCV before 4.6.
+        overwrite: replace the file where there is one.
+    """
+    from manicm_ms.calibration import CharucoSpec, print_board
+
+    board = CharucoSpec(*squares, square_length, marker_length, dictionary, legacy)
+    paper = print_board(board, out, overwrite=overwrite)
+    print(f"{out}: {board}; print it on {paper} at 100 % and measure a row of squares")
+
+
 def doctor_command() -> int:
     """Say what this machine offers and lacks, each trouble with its remedy; exit status 1 where one is fatal."""
     from manicm_ms.doctor import doctor
@@ -225,6 +296,8 @@ _PLAIN: dict[str, Command] = {
     "inspect": inspect_command,
     "convert": convert_command,
     "evaluate": evaluate_command,
+    "calibrate": calibrate_command,
+    "board": board_command,
     "cloud": cloud_command,
     "doctor": doctor_command,
 }

@@ -7,10 +7,12 @@ their seeds, so neither the number of environments nor an interruption changes t
 
 from __future__ import annotations
 
+import json
 import shlex
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import ExitStack, contextmanager
-from dataclasses import dataclass, field
+from dataclasses import asdict, dataclass, field
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -18,12 +20,15 @@ import numpy as np
 import torch
 from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 
+from manicm_ms.camera_model import read_camera
 from manicm_ms.demos.experts import EXPERTS, Expert, ExpertFactory
 from manicm_ms.demos.store import OPTIONAL_FIELDS, DemoStore, Episode, frame_shapes
+from manicm_ms.envs.simulator import ENVS
 from manicm_ms.envs.vec_env import VecEnv, make_vec
 from manicm_ms.errors import ConfigError, ManicmError, StoreError
 from manicm_ms.paths import require_free_space
 from manicm_ms.provenance import package_versions
+from manicm_ms.realism import Realism, RealismSample, realism_name, resolve_realism
 from manicm_ms.seeds import require_seed
 from manicm_ms.types import ACTION, AGENT_POS, DEPTH, IMAGE, POINT_CLOUD, STATE, EnvSpec
 
@@ -39,7 +44,12 @@ TAIL_STEPS = 8
 
 # Beyond these failures an expert is broken, not unlucky.
 _FAILURES_PER_EPISODE, _FAILURES_FREE = 10, 50
-_IDENTITY = ("env_id", "seed", "expert", "style", "tail_steps", "fields", "point_channels", "backend")
+_IDENTITY = (
+    "env_id", "seed", "expert", "style", "tail_steps", "fields", "point_channels", "backend", "realism",
+    "realism_ranges", "camera",
+)  # fmt: skip
+_UNRECORDED: Mapping[str, Any] = {"realism": "clean", "realism_ranges": None, "camera": None}
+"""What stores mean that were made before they recorded it."""
 
 
 @dataclass(frozen=True)
@@ -75,14 +85,21 @@ class Collector:
         expert: plays all rows from `state`.
         tail_steps: control steps kept after the first success where the task goes on after it.
         extras: optional fields of `Episode` to record, from `OPTIONAL_FIELDS`.
+        conditions: returns what is drawn for the episode of a seed beside its scene, to be recorded with it.
     """
 
     def __init__(
-        self, env: VecEnv, expert: Expert, *, tail_steps: int = TAIL_STEPS, extras: Iterable[str] = ()
+        self,
+        env: VecEnv,
+        expert: Expert,
+        *,
+        tail_steps: int = TAIL_STEPS,
+        extras: Iterable[str] = (),
+        conditions: Callable[[int], RealismSample] = lambda seed: {},
     ) -> None:
         if tail_steps < 0:
             raise ConfigError(f"tail_steps must not be negative, got {tail_steps}")
-        self.env, self.expert, self.tail_steps = env, expert, tail_steps
+        self.env, self.expert, self.tail_steps, self.conditions = env, expert, tail_steps, conditions
         self.spec = env.env_spec
         self.fields = ("point_cloud", "agent_pos", *extras)
         self._obs: Mapping[str, Any] = {}
@@ -177,7 +194,8 @@ class Collector:
         arrays = {name: np.stack(values) for name, values in row.frames.items()}
         if bad := [name for name, a in arrays.items() if a.dtype.kind == "f" and not np.isfinite(a).all()]:
             return Attempt(row.seed, None, f"NaN or infinity in {', '.join(bad)}")
-        return Attempt(row.seed, Episode(**arrays, seed=row.seed, success=True))
+        drawn = self.conditions(row.seed)
+        return Attempt(row.seed, Episode(**arrays, seed=row.seed, success=True, realism=drawn))
 
 
 @dataclass(frozen=True)
@@ -209,6 +227,8 @@ def collect(
     colors: bool = False,
     extras: Iterable[str] = (),
     tail_steps: int = TAIL_STEPS,
+    realism: str | Realism = "clean",
+    camera: Path | None = None,
 ) -> Collected:
     """Collect demonstrations of the registered expert of `env_id` into a store, with a progress bar.
 
@@ -226,19 +246,24 @@ def collect(
         colors: store rgb beside xyz.
         extras: optional fields of `Episode` to store, from `OPTIONAL_FIELDS`.
         tail_steps: control steps kept after the first success where the task goes on after it.
+        realism: preset or ranges, as in `make_vec`; what it draws is stored with every episode.
+        camera: YAML file of the cell's depth camera, as in `make_vec`.
 
-    Raises StoreError where `out` holds other data or has a writer already, NoSpaceError,
-    UnknownNameError for the id or the style, ManicmError where the expert fails far too often.
+    Raises StoreError where `out` holds other data or has a writer already, NoSpaceError, CameraError,
+    UnknownNameError for the id, the style or the preset, ManicmError where the expert fails far too often.
     """
-    out, extras = Path(out), tuple(extras)
+    out, extras, realism = Path(out), tuple(extras), resolve_realism(realism)
     _require_sound(episodes, num_envs, seed, extras)
-    factory = EXPERTS.get(env_id)
+    factory, model = EXPERTS.get(env_id), None if camera is None else read_camera(camera)
     asked = {
         "env_id": env_id,
         "seed": seed,
         "tail_steps": tail_steps,
         "fields": ["point_cloud", "agent_pos", ACTION, *(f for f in OPTIONAL_FIELDS if f in extras)],
         "point_channels": 6 if colors else 3,
+        "realism": realism_name(realism),
+        "realism_ranges": None if realism.is_clean else realism.to_dict(),
+        "camera": None if model is None else json.loads(json.dumps(asdict(model))),
     }
     exists = out.exists() and not (out.is_dir() and not any(out.iterdir()))
     if exists and (finished := _finished(out, episodes, asked, factory, style, backend)):
@@ -246,16 +271,20 @@ def collect(
     with ExitStack() as stack:
         # The lock is taken before the environment is made, so that a second writer is refused at once.
         store = stack.enter_context(DemoStore.open(out, "a")) if exists else None
-        env = make_vec(env_id, num_envs=num_envs, backend=backend, obs=_obs_keys(extras), colors=colors)
+        env = make_vec(
+            env_id, num_envs=num_envs, backend=backend, obs=_obs_keys(extras), colors=colors, realism=realism,
+            camera=model,
+        )  # fmt: skip
         stack.callback(env.close)
         expert = factory(env.env_spec, num_envs, env.device, style)
         asked |= {"expert": expert.name, "style": expert.style, "backend": env.backend}
-        command = _command(asked, episodes, extras, colors)
-        collector = Collector(env, expert, tail_steps=tail_steps, extras=extras)
+        command = _command(asked, episodes, extras, colors, camera)
+        conditions = partial(ENVS.get(env_id).conditions, realism)
+        collector = Collector(env, expert, tail_steps=tail_steps, extras=extras, conditions=conditions)
         if store is None:
             collector.begin(seed)  # a simulator that does not run leaves no empty store behind
             provenance = asked | {"command": command, "versions": package_versions()}
-            store = stack.enter_context(_create(out, env.env_spec, provenance, episodes))
+            store = stack.enter_context(_create(out, env.env_spec, provenance, episodes, conditions(seed)))
         _require_same_origin(store, asked, env.env_spec)
         with _progress_bar(env_id, episodes, len(store)) as report:
             added = fill(store, collector, episodes, seed, report)
@@ -274,20 +303,26 @@ def collect_episodes(
     colors: bool = False,
     extras: Iterable[str] = (),
     tail_steps: int = TAIL_STEPS,
+    realism: str | Realism = "clean",
+    camera: Path | None = None,
 ) -> list[Episode]:
     """Collect demonstrations into memory: the episodes that `collect` stores for the same arguments.
 
     Raises ConfigError, UnknownNameError, ManicmError as `collect`. An interruption loses them: for many, use `collect`.
     """
-    extras = tuple(extras)
+    extras, realism = tuple(extras), resolve_realism(realism)
     _require_sound(episodes, num_envs, seed, extras)
     factory = EXPERTS.get(env_id)
     kept: list[Episode] = []
     with ExitStack() as stack:
-        env = make_vec(env_id, num_envs=num_envs, backend=backend, obs=_obs_keys(extras), colors=colors)
+        env = make_vec(
+            env_id, num_envs=num_envs, backend=backend, obs=_obs_keys(extras), colors=colors, realism=realism,
+            camera=camera,
+        )  # fmt: skip
         stack.callback(env.close)
         expert = factory(env.env_spec, num_envs, env.device, style)
-        collector = Collector(env, expert, tail_steps=tail_steps, extras=extras)
+        conditions = partial(ENVS.get(env_id).conditions, realism)
+        collector = Collector(env, expert, tail_steps=tail_steps, extras=extras, conditions=conditions)
         report = stack.enter_context(_progress_bar(env_id, episodes, 0))
         for tried, attempt in enumerate(collector.attempts(seed, episodes), start=1):
             if attempt.episode is not None:
@@ -388,18 +423,18 @@ def _finished(
     return Collected(out, kept, tried, 0)
 
 
-def _create(out: Path, spec: EnvSpec, provenance: Mapping[str, Any], episodes: int) -> DemoStore:
+def _create(out: Path, spec: EnvSpec, provenance: Mapping[str, Any], episodes: int, drawn: Iterable[str]) -> DemoStore:
     shapes = frame_shapes(spec)
     frame_bytes = sum(int(np.prod(shapes[f][0])) * shapes[f][1].itemsize for f in provenance["fields"])
     # A solved episode takes about half the steps that it may take.
     require_free_space(out, frame_bytes * episodes * spec.max_episode_steps // 2)
     extras = [f for f in provenance["fields"] if f in OPTIONAL_FIELDS]
-    return DemoStore.create(out, spec, provenance, extras=extras)
+    return DemoStore.create(out, spec, provenance, extras=extras, realism=drawn)
 
 
 def _require_same_origin(store: DemoStore, asked: Mapping[str, Any], spec: EnvSpec | None = None) -> None:
     """Raise StoreError where the store's data came about otherwise than is asked for now."""
-    has = store.provenance
+    has = {**_UNRECORDED, **store.provenance}
     for key in _IDENTITY:
         if key in asked and has.get(key) != asked[key]:
             raise StoreError(
@@ -412,12 +447,16 @@ def _require_same_origin(store: DemoStore, asked: Mapping[str, Any], spec: EnvSp
         )
 
 
-def _command(asked: Mapping[str, Any], episodes: int, extras: tuple[str, ...], colors: bool) -> str:
+def _command(
+    asked: Mapping[str, Any], episodes: int, extras: tuple[str, ...], colors: bool, camera: Path | None
+) -> str:
     """Return the command that makes the same data (the number of environments has no part in it)."""
     words = ["manicm-ms", "collect", asked["env_id"], "--episodes", episodes, "--seed", asked["seed"]]
     words += ["--style", asked["style"], "--backend", asked["backend"]]
     words += ["--tail-steps", asked["tail_steps"]] if asked["tail_steps"] != TAIL_STEPS else []
     words += ["--colors"] if colors else []
+    words += ["--realism", asked["realism"]] if asked["realism"] != "clean" else []
+    words += ["--camera", camera] if camera is not None else []
     words += ["--extras", *extras] if extras else []
     return shlex.join(str(w) for w in words)
 

@@ -13,6 +13,8 @@
       meta/episode_ends        (E,) int64, one past the last frame of each episode
       meta/{seed,length}       (E,) int64
       meta/success             (E,) bool
+      meta/realism             (E, K) float64, what was drawn for each episode, only where something was; the names of
+                               the K values are the array's attribute `names`
 
 An episode exists when `episode_ends` says so. `append` first writes the frames and the other meta
 arrays, then the new end into a chunk beyond the array's length, and last replaces
@@ -23,6 +25,7 @@ when the store is next opened for appending.
 
 from __future__ import annotations
 
+import dataclasses
 import errno
 import json
 import os
@@ -77,6 +80,7 @@ class Episode:
         image: (L, H, W, 3) uint8, or None.
         depth: (L, H, W) float32 metres, or None.
         privileged_state: (L, S) float32, or None.
+        realism: name -> value of what was drawn for this episode beside the scene; empty where nothing was.
     """
 
     point_cloud: np.ndarray
@@ -87,6 +91,7 @@ class Episode:
     image: np.ndarray | None = None
     depth: np.ndarray | None = None
     privileged_state: np.ndarray | None = None
+    realism: Mapping[str, float] = dataclasses.field(default_factory=dict)
 
     def __len__(self) -> int:
         return len(self.action)
@@ -118,13 +123,20 @@ class DemoStore:
         self.spec = EnvSpec.from_dict(self._attrs["env_spec"])
         self._group = zarr.open_group(str(path), mode="r" if mode == "r" else "r+", zarr_format=2)
         self._fields = [f for f, name in FRAME_ARRAYS.items() if (path / "data" / name / ".zarray").is_file()]
+        self.realism_names = self._read_realism_names()
         self._check_layout()
         self._dirty = mode == "a"
         self._cut()
 
     @classmethod
     def create(
-        cls, path: Path | str, spec: EnvSpec, provenance: Mapping[str, Any], *, extras: Iterable[str] = ()
+        cls,
+        path: Path | str,
+        spec: EnvSpec,
+        provenance: Mapping[str, Any],
+        *,
+        extras: Iterable[str] = (),
+        realism: Iterable[str] = (),
     ) -> DemoStore:
         """Make an empty store and return it open for appending.
 
@@ -133,15 +145,16 @@ class DemoStore:
             spec: of the environment that the demonstrations come from.
             provenance: JSON values that say how the data came about (expert, style, versions, command).
             extras: optional fields of `Episode` to store too, from `OPTIONAL_FIELDS`.
+            realism: names of the values that every episode's `realism` will hold.
 
         Raises OutputExistsError where something stands at `path`, NoSpaceError on a full disk.
         """
-        path, extras = Path(path), tuple(extras)
+        path, extras, realism = Path(path), tuple(extras), tuple(realism)
         if unknown := set(extras) - set(OPTIONAL_FIELDS):
             raise StoreError(f"a store has no optional field {sorted(unknown)}: choose from {OPTIONAL_FIELDS}")
         require_free_space(path, _SPARE_BYTES)
         with temporary_folder(path) as fresh:
-            _write_empty(fresh, spec, dict(provenance), extras)
+            _write_empty(fresh, spec, dict(provenance), extras, realism)
             try:
                 os.rename(fresh, path)  # refuses to replace anything but an empty folder
             except OSError as e:
@@ -223,6 +236,11 @@ class DemoStore:
         return self._meta("success")
 
     @property
+    def realism(self) -> np.ndarray:
+        """(E, K) float64: the values of `realism_names` that were drawn for each episode; K is 0 where none were."""
+        return self._meta("realism") if self.realism_names else np.zeros((len(self), 0))
+
+    @property
     def lengths(self) -> np.ndarray:
         """(E,) int64, control steps of each episode."""
         return np.diff(self.episode_ends, prepend=0)
@@ -261,7 +279,8 @@ class DemoStore:
         index = range(len(ends))[index]
         start, stop = (int(ends[index - 1]) if index else 0), int(ends[index])
         arrays = {f: self.frames(f, start, stop) for f in self._fields}
-        return Episode(**arrays, seed=int(self.seeds[index]), success=bool(self.successes[index]))
+        drawn = dict(zip(self.realism_names, self.realism[index].tolist(), strict=True))
+        return Episode(**arrays, seed=int(self.seeds[index]), success=bool(self.successes[index]), realism=drawn)
 
     def append(self, episode: Episode) -> None:
         """Append one episode; when this returns it is committed and on the disk.
@@ -271,6 +290,7 @@ class DemoStore:
         """
         self._require_writer()
         frames = {f: self._checked(f, episode) for f in self._fields}
+        self._checked_realism(episode)
         require_free_space(self.path, 2 * sum(a.nbytes for a in frames.values()) + _SPARE_BYTES)
         self._cut()
         self._dirty = True
@@ -327,6 +347,27 @@ class DemoStore:
             raise StoreError(f"{field} of the episode of seed {episode.seed} holds NaN or infinity: not stored")
         return array
 
+    def _checked_realism(self, episode: Episode) -> np.ndarray:
+        """Return the episode's drawn values in the order of the store, (K,); refuse other names or no numbers."""
+        if set(episode.realism) != set(self.realism_names):
+            differing = sorted(set(episode.realism) ^ set(self.realism_names))
+            raise StoreError(
+                f"the episode of seed {episode.seed} was not drawn from the realism of {self.path}: "
+                f"{', '.join(differing[:3])} are in one of the two only"
+            )
+        drawn = np.array([episode.realism[name] for name in self.realism_names], "<f8")
+        if not np.isfinite(drawn).all():
+            raise StoreError(f"realism of the episode of seed {episode.seed} holds NaN or infinity: not stored")
+        return drawn
+
+    def _meta_names(self) -> tuple[str, ...]:
+        return (*EPISODE_ARRAYS, "realism") if self.realism_names else tuple(EPISODE_ARRAYS)
+
+    def _read_realism_names(self) -> tuple[str, ...]:
+        if not (self.path / "meta" / "realism" / ".zarray").is_file():
+            return ()
+        return tuple(self._meta_array("realism").attrs["names"])  # type: ignore[arg-type]
+
     def _write_frames(self, frames: Mapping[str, np.ndarray], episode: Episode) -> None:
         """Write everything but the end of the episode, and see it onto the disk."""
         start, number = self.num_frames, len(self)
@@ -335,9 +376,11 @@ class DemoStore:
         values = {"seed": episode.seed, "success": episode.success, "length": len(episode)}
         for name, dtype in EPISODE_ARRAYS.items():
             _extend(self._meta_array(name), number, np.array([values[name]], dtype))
+        if self.realism_names:
+            _extend(self._meta_array("realism"), number, self._checked_realism(episode)[None])
         for field in frames:
             _sync_rows(self.path / "data" / FRAME_ARRAYS[field], self._frame_array(field), start)
-        for name in EPISODE_ARRAYS:
+        for name in self._meta_names():
             _sync_rows(self.path / "meta" / name, self._meta_array(name), number)
 
     def _commit(self, end: int) -> None:
@@ -364,7 +407,7 @@ class DemoStore:
         self._group = zarr.open_group(str(self.path), mode="r+", zarr_format=2)
         for field in self._fields:
             _shorten(self._frame_array(field), self.num_frames)
-        for name in EPISODE_ARRAYS:
+        for name in self._meta_names():
             _shorten(self._meta_array(name), len(self))
         self._dirty = False
 
@@ -384,12 +427,14 @@ class DemoStore:
                     f"{self.path} is damaged: data/{FRAME_ARRAYS[field]} is {array.shape} {array.dtype} where "
                     f"{self.num_frames} frames of {shape} {dtype} are committed"
                 )
-        for name in EPISODE_ARRAYS:
+        for name in self._meta_names():
             if self._meta_array(name).shape[0] < len(ends):
                 raise StoreError(f"{self.path} is damaged: meta/{name} is shorter than meta/episode_ends")
 
 
-def _write_empty(path: Path, spec: EnvSpec, provenance: dict[str, Any], extras: tuple[str, ...]) -> None:
+def _write_empty(
+    path: Path, spec: EnvSpec, provenance: dict[str, Any], extras: tuple[str, ...], realism: tuple[str, ...]
+) -> None:
     group = zarr.create_group(str(path), zarr_format=2)
     data, meta = group.create_group("data"), group.create_group("meta")
     compressor = numcodecs.Blosc("zstd", clevel=3, shuffle=numcodecs.Blosc.SHUFFLE)
@@ -404,6 +449,11 @@ def _write_empty(path: Path, spec: EnvSpec, provenance: dict[str, Any], extras: 
         )
     for name, dtype in EPISODE_ARRAYS.items():
         meta.create_array(name, shape=(0,), chunks=(_CHUNK_EPISODES,), dtype=dtype, compressors=None, fill_value=0)
+    if realism:
+        meta.create_array(
+            "realism", shape=(0, len(realism)), chunks=(_CHUNK_EPISODES, len(realism)), dtype="<f8",
+            compressors=compressor, fill_value=0, attributes={"names": list(realism)},
+        )  # fmt: skip
     # No compressor: the commit writes this array's chunk itself, as plain little-endian numbers.
     meta.create_array(
         "episode_ends", shape=(0,), chunks=(_CHUNK_EPISODES,), dtype="<i8", compressors=None, fill_value=0
