@@ -186,22 +186,28 @@ def depth_to_cloud(
     if T_base_camera is None:
         T_base_camera = torch.tensor(camera.T_base_camera, dtype=torch.float32, device=device).expand(n, 4, 4)
     if device.type == "cpu":
-        clouds = [
-            _row_cloud(xyz[k], None if colors is None else colors[k], T_base_camera[k], workspace, num_points)
-            for k in range(n)
-        ]
-        return torch.stack(clouds)
-    base = transform(xyz, T_base_camera)
+        return _clouds_by_row(xyz, colors, T_base_camera, workspace, num_points)
+    return _clouds_together(xyz, colors, T_base_camera, workspace, num_points)
+
+
+def _clouds_by_row(xyz: Tensor, colors: Tensor | None, T: Tensor, workspace: Box, num_points: int) -> Tensor:
+    """Return clouds (N, P, C) of points (N, M, 3) in camera axes: a row at a time, the quick way on a CPU."""
+    clouds = []
+    for k in range(len(xyz)):
+        camera_points = xyz[k].numpy()
+        read = np.flatnonzero(camera_points[:, 2])
+        index, points = crop_transformed(camera_points[read], T[k].numpy(), workspace)
+        if colors is not None:
+            points = np.concatenate([points, colors[k].numpy()[read[index]]], axis=1)
+        clouds.append(torch.from_numpy(sample_cloud(points, num_points)))
+    return torch.stack(clouds)
+
+
+def _clouds_together(xyz: Tensor, colors: Tensor | None, T: Tensor, workspace: Box, num_points: int) -> Tensor:
+    """Return the same without a loop over rows, for a device: the order starts from the first point of the cloud."""
+    base = transform(xyz, T)
     points = base if colors is None else torch.cat([base, colors], dim=-1)
-    return sample_cloud_batch(points, (z > 0) & inside(base, workspace), num_points)
-
-
-def _row_cloud(xyz: Tensor, colors: Tensor | None, T_base_camera: Tensor, workspace: Box, num_points: int) -> Tensor:
-    read = np.flatnonzero(xyz[:, 2].numpy())
-    index, points = crop_transformed(xyz.numpy()[read], T_base_camera.numpy(), workspace)
-    if colors is not None:
-        points = np.concatenate([points, colors.numpy()[read[index]]], axis=1)
-    return torch.from_numpy(sample_cloud(points, num_points))
+    return sample_cloud_batch(points, (xyz[..., 2] > 0) & inside(base, workspace), num_points)
 
 
 # ---- files ----------------------------------------------------------------------------------------------------

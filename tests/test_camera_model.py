@@ -9,6 +9,7 @@ import pytest
 import torch
 import yaml
 
+from manicm_ms import camera_model, point_cloud
 from manicm_ms.camera_model import (
     CameraModel,
     Crop,
@@ -139,6 +140,28 @@ def test_colours_stay_with_their_pixels():
     cloud = depth_to_cloud(tensor(table_depth()), CAMERA, WORKSPACE, 200, rgb=rgb)[0].numpy()
     assert cloud.shape == (200, 6)
     np.testing.assert_allclose(cloud[:, 3:], ((cloud[:, :3] - points.min()) / 3).clip(0, 1), atol=1e-6)
+
+
+@pytest.mark.parametrize("colored", [False, True])
+def test_all_rows_together_give_what_one_after_the_other_does(monkeypatch, colored):
+    monkeypatch.setattr(point_cloud, "bucket_fps_kdline_sampling", None)  # it starts from another point
+    generator = torch.Generator().manual_seed(4)
+    depth = tensor(table_depth(0.03), rows=3) - 0.05 * torch.rand(3, H, W, generator=generator)
+    depth[torch.rand(3, H, W, generator=generator) < 0.2] = 0.0
+    depth[2] = 0.0
+    rgb = torch.rand(3, H, W, 3, generator=generator) if colored else None
+    by_row = depth_to_cloud(depth, CAMERA, WORKSPACE, 64, rgb=rgb)
+    monkeypatch.setattr(camera_model, "_clouds_by_row", camera_model._clouds_together)  # as on a device
+    torch.testing.assert_close(depth_to_cloud(depth, CAMERA, WORKSPACE, 64, rgb=rgb), by_row, atol=1e-6, rtol=0)
+    assert by_row[:2].any(dim=-1).all()
+
+
+@pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a CUDA device")
+def test_a_device_gives_the_same_points(monkeypatch):
+    monkeypatch.setattr(point_cloud, "bucket_fps_kdline_sampling", None)
+    depth = tensor(table_depth(0.03), rows=2)
+    there = depth_to_cloud(depth.cuda(), CAMERA, WORKSPACE, 64).cpu()
+    torch.testing.assert_close(there, depth_to_cloud(depth, CAMERA, WORKSPACE, 64), atol=1e-6, rtol=0)
 
 
 def test_a_depth_image_of_another_crop_is_refused():

@@ -281,6 +281,14 @@ def test_whatever_the_scene_readings_are_finite_and_in_range():
     assert not run(StereoDepth(), torch.zeros(1, H, W)).any()
 
 
+@pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a CUDA device")
+def test_a_device_draws_from_the_same_law():
+    there = run(StereoDepth(), plane(0.6, rows=8).cuda()).cpu()
+    here = run(StereoDepth(), plane(0.6, rows=8))
+    assert there[there > 0].std().item() == pytest.approx(here[here > 0].std().item(), rel=0.05)
+    assert (there == 0).float().mean().item() == pytest.approx((here == 0).float().mean().item(), abs=0.005)
+
+
 @pytest.mark.parametrize(
     "change",
     [
