@@ -21,8 +21,9 @@ _PIXELS_PER_BIT = 8  # at which a marker's bits are read; OpenCV's 4 lose the no
 _MIN_RELIEF = 0.1  # smallest extent of the seen corners / largest: below, they lie nearly on one line
 _PAPER_M = {"A4": (0.210, 0.297), "A3": (0.297, 0.420), "A2": (0.420, 0.594), "A1": (0.594, 0.841)}
 _PRINT_MARGIN_M = 0.01  # that common printers leave white
-_PIXELS_PER_M = 20_000  # of the printed picture
+_PIXELS_PER_M = 10_000  # of the printed picture
 _INCH_M = 0.0254
+_DPI = 300  # of a PNG; PDF and SVG hold the picture as it is
 
 
 @dataclass(frozen=True)
@@ -158,7 +159,7 @@ def print_board(spec: CharucoSpec, out: Path, *, overwrite: bool = False) -> str
     axes.set_axis_off()
     figure.text(0.5, 0.25 - height / 4, f"{spec}; print at 100 % on {paper}", ha="center", va="center", fontsize=7)
     out.parent.mkdir(parents=True, exist_ok=True)
-    figure.savefig(out, dpi=600)
+    figure.savefig(out, dpi=_DPI)
     return paper
 
 

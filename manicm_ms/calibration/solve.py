@@ -227,7 +227,8 @@ def _read_images(folder: Path, tools: dict[str, RigidTransform], template: Camer
         )
     pictures: dict[str, np.ndarray] = {}
     for name in names:
-        picture = cv2.imdecode(np.fromfile(folder / name, np.uint8), cv2.IMREAD_GRAYSCALE)
+        data = np.frombuffer((folder / name).read_bytes(), np.uint8)
+        picture = cv2.imdecode(data, cv2.IMREAD_GRAYSCALE) if len(data) else None
         if picture is None:
             raise CalibrationError(f"{folder / name} is no image that can be read: record it again or move it away")
         pictures[name] = picture
