@@ -308,6 +308,21 @@ REALISM.add(
 )
 
 
+def parse_presets(text: str) -> tuple[str, ...]:
+    """Return the presets that a comma-separated list names, each once, in its order.
+
+    Raises UnknownNameError, ConfigError where there is none or one stands twice.
+    """
+    names = tuple(name.strip() for name in text.split(",") if name.strip())
+    for name in names:
+        REALISM.get(name)
+    if not names or len(set(names)) < len(names):
+        raise ConfigError(
+            f"name each realism preset once, separated by commas ({', '.join(REALISM.names())}): {text!r}"
+        )
+    return names
+
+
 def realism_name(realism: Realism) -> str:
     """Return the name of the preset with these ranges, "custom" where there is none."""
     return next((name for name in REALISM.names() if REALISM.get(name) == realism), "custom")

@@ -170,6 +170,8 @@ def evaluate_command(
     control: bool = True,
     videos: int = 4,
     threads: int = 1,
+    realism: str = "clean",
+    camera: Path | None = None,
 ) -> None:
     """Judge checkpoints on the same fresh seeds: success with intervals, paired difference, decision latency, report.
 
@@ -185,12 +187,15 @@ def evaluate_command(
         control: add the teacher run in one step, without distillation.
         videos: seeds filmed.
         threads: torch threads while policies act and latency is measured.
+        realism: presets separated by commas, as in clean,d435i,d435i+dr: every policy plays the same seeds under each.
+        camera: YAML file of the cell's depth camera, as 'manicm-ms calibrate' writes it.
     """
     from manicm_ms.evaluation.judge import evaluate
 
     evaluate(
         _at_least_one(checkpoints, "checkpoint folder"), env, episodes, seed, out, num_envs=num_envs, backend=backend,
-        device=device, control=control, videos=videos, threads=threads, command=this_command(),
+        device=device, control=control, videos=videos, threads=threads, realism=realism,
+        camera=camera, command=this_command(),
     )  # fmt: skip
 
 

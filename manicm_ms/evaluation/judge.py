@@ -6,25 +6,27 @@ import json
 import re
 import shlex
 from collections.abc import Callable, Mapping, Sequence
-from contextlib import ExitStack
-from dataclasses import dataclass, replace
+from dataclasses import asdict, dataclass, replace
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 
+from manicm_ms.camera_model import CameraModel, read_camera
 from manicm_ms.devices import resolve_device, torch_threads
 from manicm_ms.errors import ConfigError, OutputExistsError
 from manicm_ms.evaluation.latency import Latency, measure_latency
 from manicm_ms.evaluation.machine import machine
 from manicm_ms.evaluation.records import EpisodeLog, claimed_folder
-from manicm_ms.evaluation.report import crash_lines, paired_sentences, summary_table, write_report
+from manicm_ms.evaluation.report import crash_lines, paired_sentences, summary_tables, write_report
 from manicm_ms.evaluation.rollout import EpisodeResult, RestartableEnv, rollout
 from manicm_ms.evaluation.statistics import compare_paired, success_rate
 from manicm_ms.evaluation.video import Take, choose_seeds, film
 from manicm_ms.paths import sha256, write_json
 from manicm_ms.provenance import package_versions
+from manicm_ms.realism import REALISM, RealismSample, parse_presets
 from manicm_ms.seeds import require_seed
 from manicm_ms.types import AGENT_POS, ChunkSpec, EnvSpec, require_compatible
 
@@ -33,7 +35,12 @@ if TYPE_CHECKING:
     from manicm_ms.policies.base import Policy
 
 TEACHER, CONTROL, STUDENT = "teacher", "control", "student"
+CLEAN = "clean"
+"""Realism preset of the ideal world."""
 SCHEMA_VERSION = 1
+
+Conditions = Callable[[str, int], RealismSample]
+"""(realism preset, seed) -> what is drawn for that episode beside its scene."""
 
 
 @dataclass(frozen=True)
@@ -64,6 +71,7 @@ class Protocol:
         threads: torch's intra-op threads while policies act and latency is measured.
         repetitions: timed decisions per policy.
         videos: seeds filmed, for each of teacher and student.
+        realism: presets under which every policy plays all seeds; the first is that of the main results and videos.
     """
 
     env_id: str
@@ -72,6 +80,7 @@ class Protocol:
     threads: int = 1
     repetitions: int = 50
     videos: int = 4
+    realism: tuple[str, ...] = (CLEAN,)
 
     def __post_init__(self) -> None:
         if not self.seeds:
@@ -85,12 +94,14 @@ class EnvMaker(NamedTuple):
     """Makes the vector envs that an evaluation needs.
 
     Attributes:
-        for_policy: (policy, num_envs) -> env that exchanges histories and chunks as the policy does.
-        for_film: (num_envs) -> env without a chunk, with `render_video_frames`.
+        for_policy: (policy, num_envs, realism preset) -> env that exchanges histories and chunks as the policy does.
+        for_film: (num_envs, realism preset) -> env without a chunk, with `render_video_frames`.
+        conditions: (realism preset, seed) -> what is drawn for that episode beside its scene.
     """
 
-    for_policy: Callable[[Policy, int], VecEnv]
-    for_film: Callable[[int], VecEnv]
+    for_policy: Callable[[Policy, int, str], VecEnv]
+    for_film: Callable[[int, str], VecEnv]
+    conditions: Conditions = lambda preset, seed: {}
 
 
 def evaluate(
@@ -107,6 +118,8 @@ def evaluate(
     videos: int = 4,
     threads: int = 1,
     repetitions: int = 50,
+    realism: str = CLEAN,
+    camera: Path | None = None,
     command: str | None = None,
     console: Console | None = None,
 ) -> dict[str, Any]:
@@ -128,6 +141,8 @@ def evaluate(
         videos: seeds filmed for teacher and student.
         threads: torch threads while policies act and latency is measured.
         repetitions: timed decisions per policy.
+        realism: one or more presets, separated by commas: all policies play the same seeds under each of them.
+        camera: YAML file of the cell's depth camera, as in `make_vec`.
         command: the command line to print in the report; None writes the equivalent of this call.
         console: where progress and table are printed; None is standard output.
 
@@ -135,8 +150,8 @@ def evaluate(
         What results.json holds.
 
     Raises:
-        UnknownNameError, CheckpointError, SpecMismatchError, ConfigError, OutputExistsError, NoSpaceError,
-        BackendError.
+        UnknownNameError, CheckpointError, SpecMismatchError, ConfigError, CameraError, OutputExistsError,
+        NoSpaceError, BackendError.
     """
     from manicm_ms.envs.simulator import ENVS
     from manicm_ms.envs.vec_env import default_num_envs, resolve_backend
@@ -145,7 +160,9 @@ def evaluate(
     if episodes < 1:
         raise ConfigError(f"--episodes must be at least 1, got {episodes}")
     rows = min(num_envs or default_num_envs(), episodes)
-    protocol = Protocol(env_id, tuple(range(seed, seed + episodes)), rows, threads, repetitions, videos)
+    seeds, presets = tuple(range(seed, seed + episodes)), parse_presets(realism)
+    protocol = Protocol(env_id, seeds, rows, threads, repetitions, videos, presets)
+    model = None if camera is None else read_camera(camera)
     spec, backend = ENVS.get(env_id).spec, resolve_backend(backend)
     contenders = load_contenders(checkpoints, device, control)
     for contender in contenders:
@@ -158,24 +175,41 @@ def evaluate(
         "backend": backend,
         "device": device,
         "policies": [[c.name, c.role, checkpoint_digest(c.checkpoint)] for c in contenders],
+        **_requested_realism(presets, model),
     }
-    command = command or _command(checkpoints, env_id, episodes, seed, out)
-    return judge(contenders, protocol, _env_maker(env_id, backend), out, request, command, console or Console())
+    command = command or _command(checkpoints, env_id, episodes, seed, out, realism, camera)
+    envs = _env_maker(env_id, backend, model)
+    return judge(contenders, protocol, envs, out, request, command, console or Console())
 
 
-def _env_maker(env_id: str, backend: str) -> EnvMaker:
+def _requested_realism(presets: tuple[str, ...], camera: CameraModel | None) -> dict[str, Any]:
+    """Return what identifies presets and camera of an evaluation; nothing in the ideal world, as ever."""
+    requested: dict[str, Any] = {}
+    if presets != (CLEAN,):
+        requested["realism"] = [[name, REALISM.get(name).to_dict()] for name in presets]
+    if camera is not None:
+        requested["camera"] = asdict(camera)
+    return requested
+
+
+def _env_maker(env_id: str, backend: str, camera: CameraModel | None) -> EnvMaker:
+    from manicm_ms.envs.simulator import ENVS
     from manicm_ms.envs.vec_env import make_vec
 
-    def for_policy(policy: Policy, n: int) -> VecEnv:
+    def for_policy(policy: Policy, n: int, preset: str) -> VecEnv:
         obs = policy.spec.obs
         return make_vec(
-            env_id, n, backend, chunk=policy.chunk, num_points=obs.num_points, colors=obs.point_channels == 6
-        )
+            env_id, n, backend, chunk=policy.chunk, num_points=obs.num_points, colors=obs.point_channels == 6,
+            realism=preset, camera=camera,
+        )  # fmt: skip
 
-    def for_film(n: int) -> VecEnv:
-        return make_vec(env_id, n, backend, obs=(AGENT_POS,), video=True)
+    def for_film(n: int, preset: str) -> VecEnv:
+        return make_vec(env_id, n, backend, obs=(AGENT_POS,), video=True, realism=preset, camera=camera)
 
-    return EnvMaker(for_policy, for_film)
+    def conditions(preset: str, seed: int) -> RealismSample:
+        return ENVS.get(env_id).conditions(REALISM.get(preset), seed)
+
+    return EnvMaker(for_policy, for_film, conditions)
 
 
 def load_contenders(checkpoints: Sequence[Path], device: str = "cpu", control: bool = True) -> list[Contender]:
@@ -242,14 +276,18 @@ def judge(
     """
     with claimed_folder(out, request):
         latencies = _latencies(contenders, protocol, out / "latency.json")
-        episodes, spec = _play(contenders, protocol, envs, out, console)
-        results = compile_results(contenders, protocol, episodes, latencies, command)
+        by_preset, spec = _play(contenders, protocol, envs, out, console)
+        episodes = by_preset[protocol.realism[0]]
+        results = compile_results(contenders, protocol, episodes, latencies, command, envs.conditions)
+        if protocol.realism != (CLEAN,):
+            results["realism"] = _realism_entry(contenders, protocol, by_preset, envs.conditions)
         results["success_rule"] = spec.success_rule
         results["videos"] = []
         _write(results, out)  # before filming, which may fail or be stopped
         results["videos"] = _film(contenders, protocol, envs, out, episodes, spec, console)
         _write(results, out)
-    console.print(summary_table(results))
+    for table in summary_tables(results):
+        console.print(table)
     for sentence in (*paired_sentences(results), *crash_lines(results)):
         console.print(sentence, highlight=False, markup=False)
     console.print(f"report: {out / 'report.html'}", soft_wrap=True)
@@ -267,9 +305,11 @@ def compile_results(
     episodes: Mapping[str, Sequence[EpisodeResult]],
     latencies: Mapping[str, Latency],
     command: str,
+    conditions: Conditions = lambda preset, seed: {},
 ) -> dict[str, Any]:
     """Return the content of results.json; every count in it is derived from the per-episode records here."""
-    policies = [_policy_entry(c, episodes[c.name], latencies[c.name]) for c in contenders]
+    drawn = partial(conditions, protocol.realism[0])
+    policies = [_policy_entry(c, episodes[c.name], latencies[c.name], drawn) for c in contenders]
     return {
         "schema_version": SCHEMA_VERSION,
         "env_id": protocol.env_id,
@@ -283,40 +323,84 @@ def compile_results(
     }
 
 
-def _policy_entry(contender: Contender, episodes: Sequence[EpisodeResult], latency: Latency) -> dict[str, Any]:
-    rate = success_rate([e.success for e in episodes])
+def _policy_entry(
+    contender: Contender,
+    episodes: Sequence[EpisodeResult],
+    latency: Latency,
+    drawn: Callable[[int], RealismSample],
+) -> dict[str, Any]:
     return {
         "name": contender.name,
         "role": contender.role,
         "checkpoint": contender.checkpoint,
         "nfe": contender.policy.nfe,
-        "n": rate.n,
-        "successes": rate.successes,
-        "success_rate": rate.rate,
-        "ci95": list(rate.ci95),
-        "crashed": sum(e.crashed is not None for e in episodes),
+        **_rate_entry(episodes),
         "latency_ms": {"median": latency.median_ms, "p95": latency.p95_ms, "n": latency.n},
         "device": latency.device,
         "threads": latency.threads,
         "dtype": latency.dtype,
         "parameters": sum(p.numel() for p in contender.policy.parameters()),
-        "episodes": [e.summary() for e in episodes],
+        "episodes": _episode_entries(episodes, drawn),
     }
+
+
+def _rate_entry(episodes: Sequence[EpisodeResult]) -> dict[str, Any]:
+    rate = success_rate([e.success for e in episodes])
+    return {
+        "n": rate.n,
+        "successes": rate.successes,
+        "success_rate": rate.rate,
+        "ci95": list(rate.ci95),
+        "crashed": sum(e.crashed is not None for e in episodes),
+    }
+
+
+def _episode_entries(episodes: Sequence[EpisodeResult], drawn: Callable[[int], RealismSample]) -> list[dict[str, Any]]:
+    """Return the records of episodes, each with what was drawn for it where something was."""
+    return [e.summary() | ({"realism": values} if (values := drawn(e.seed)) else {}) for e in episodes]
+
+
+def _realism_entry(
+    contenders: Sequence[Contender],
+    protocol: Protocol,
+    by_preset: Mapping[str, Mapping[str, Sequence[EpisodeResult]]],
+    conditions: Conditions,
+) -> dict[str, Any]:
+    """Return how every policy fared under every preset, each against the same policy in the ideal world."""
+    presets = protocol.realism
+    reference = CLEAN if CLEAN in presets else presets[0]
+    rows = []
+    for preset in presets:
+        for contender in contenders:
+            ideal, episodes = (by_preset[name][contender.name] for name in (reference, preset))
+            rows.append({
+                "preset": preset,
+                "policy": contender.name,
+                "role": contender.role,
+                **_rate_entry(episodes),
+                "against_reference": None if preset == reference else _pair_entry(ideal, episodes),
+                "episodes": _episode_entries(episodes, partial(conditions, preset)),
+            })  # fmt: skip
+    return {"presets": list(presets), "reference": reference, "rows": rows}
 
 
 def _paired_entry(
     first: Contender, second: Contender, episodes: Mapping[str, Sequence[EpisodeResult]]
 ) -> dict[str, Any]:
-    pair = compare_paired(
-        [e.success for e in episodes[first.name]],
-        [e.success for e in episodes[second.name]],
-    )
     return {
         "first": first.name,
         "second": second.name,
+        "difference_is": "success rate of the second minus that of the first",
+        **_pair_entry(episodes[first.name], episodes[second.name]),
+    }
+
+
+def _pair_entry(first: Sequence[EpisodeResult], second: Sequence[EpisodeResult]) -> dict[str, Any]:
+    """Return the comparison of two lists of episodes on the same seeds; `difference` is second minus first."""
+    pair = compare_paired([e.success for e in first], [e.success for e in second])
+    return {
         **pair.counts._asdict(),
         "difference": pair.difference,
-        "difference_is": "success rate of the second minus that of the first",
         "difference_ci95": list(pair.difference_ci95),
         "mcnemar_p": pair.mcnemar_p,
     }
@@ -349,24 +433,49 @@ def _stored_latencies(path: Path) -> dict[str, Latency]:
 
 def _play(
     contenders: Sequence[Contender], protocol: Protocol, envs: EnvMaker, out: Path, console: Console
-) -> tuple[dict[str, list[EpisodeResult]], EnvSpec]:
-    """Play what is not yet on disk; return each contender's results in the order of the seeds, and the env's spec."""
-    results: dict[str, list[EpisodeResult]] = {}
-    with ExitStack() as stack:
-        bench = stack.enter_context(_Bench(envs, protocol))
-        progress = stack.enter_context(_progress(console))
-        for contender in contenders:
-            log = stack.enter_context(EpisodeLog(out / "episodes" / f"{slug(contender.name)}.jsonl"))
-            missing = [s for s in protocol.seeds if s not in log]
-            done = len(protocol.seeds) - len(missing)
-            bar = progress.add_task(contender.name, total=len(protocol.seeds), completed=done, successes="")
-            if missing:
-                home = bench.home(contender)
-                with torch_threads(protocol.threads):  # more fight the workers for the cores
-                    rollout(home, contender.policy, missing, on_episode=_recorder(log, progress, bar))
-            results[contender.name] = [log[s] for s in protocol.seeds]
-            progress.update(bar, successes=f"{sum(e.success for e in results[contender.name])} successes")
-        return results, bench.spec or contenders[0].policy.spec
+) -> tuple[dict[str, dict[str, list[EpisodeResult]]], EnvSpec]:
+    """Play what is not yet on disk.
+
+    Returns:
+        preset -> policy -> results in the order of the seeds, and the env's spec.
+    """
+    results: dict[str, dict[str, list[EpisodeResult]]] = {}
+    spec = contenders[0].policy.spec
+    with _progress(console) as progress:
+        for preset in protocol.realism:
+            with _Bench(envs, protocol, preset) as bench:
+                results[preset] = {
+                    contender.name: _play_policy(
+                        contender, bench, protocol, log_file(out, preset, contender.name), progress
+                    )
+                    for contender in contenders
+                }
+            spec = bench.spec or spec
+    return results, spec
+
+
+def _play_policy(
+    contender: Contender, bench: _Bench, protocol: Protocol, file: Path, progress: Progress
+) -> list[EpisodeResult]:
+    """Play what one policy has not yet played on the bench; return its results in the order of the seeds."""
+    with EpisodeLog(file) as log:
+        missing = [s for s in protocol.seeds if s not in log]
+        done = len(protocol.seeds) - len(missing)
+        title = contender.name if protocol.realism == (CLEAN,) else f"{bench.preset}: {contender.name}"
+        bar = progress.add_task(title, total=len(protocol.seeds), completed=done, successes="")
+        if missing:
+            home = bench.home(contender)
+            with torch_threads(protocol.threads):  # more fight the workers for the cores
+                rollout(home, contender.policy, missing, on_episode=_recorder(log, progress, bar))
+        results = [log[s] for s in protocol.seeds]
+        progress.update(bar, successes=f"{sum(e.success for e in results)} successes")
+    return results
+
+
+def log_file(out: Path, preset: str, policy: str) -> Path:
+    """Return the file of one policy's episodes under one realism preset."""
+    folder = out / "episodes" if preset == CLEAN else out / "episodes" / slug(preset)
+    return folder / f"{slug(policy)}.jsonl"
 
 
 def _recorder(log: EpisodeLog, progress: Progress, bar: Any) -> Callable[[EpisodeResult], None]:
@@ -384,8 +493,8 @@ def _recorder(log: EpisodeLog, progress: Progress, bar: Any) -> Callable[[Episod
 class _Bench:
     """Keeps one vector env alive across contenders that exchange the same chunks: workers start slowly."""
 
-    def __init__(self, envs: EnvMaker, protocol: Protocol) -> None:
-        self._envs, self._protocol = envs, protocol
+    def __init__(self, envs: EnvMaker, protocol: Protocol, preset: str) -> None:
+        self._envs, self._protocol, self.preset = envs, protocol, preset
         self._home: RestartableEnv | None = None
         self._shape: tuple[int, ...] = ()
         self.spec: EnvSpec | None = None
@@ -396,7 +505,8 @@ class _Bench:
         shape = _exchange(policy.chunk, policy.spec)
         if self._home is None or shape != self._shape:
             self._close()
-            self._home = RestartableEnv(lambda: self._envs.for_policy(policy, self._protocol.num_envs))
+            rows = self._protocol.num_envs
+            self._home = RestartableEnv(lambda: self._envs.for_policy(policy, rows, self.preset))
             self._shape = shape
         self.spec = self._home.env.env_spec
         env_name = f"environment {self.spec.env_id}"
@@ -445,7 +555,7 @@ def _film(
     try:
         with _progress(console) as progress:
             bar = progress.add_task("videos", total=len(takes), successes="")
-            vec_env = envs.for_film(min(protocol.num_envs, len(takes)))
+            vec_env = envs.for_film(min(protocol.num_envs, len(takes)), protocol.realism[0])
             try:
                 for take, success in film(vec_env, takes, spec.action.control_hz):
                     progress.update(bar, advance=1)
@@ -476,6 +586,10 @@ def slug(name: str) -> str:
     return re.sub(r"[^\w-]+", "-", name).strip("-")
 
 
-def _command(checkpoints: Sequence[Path], env_id: str, episodes: int, seed: int, out: Path) -> str:
+def _command(
+    checkpoints: Sequence[Path], env_id: str, episodes: int, seed: int, out: Path, realism: str, camera: Path | None
+) -> str:
     words = ["manicm-ms", "evaluate", *map(str, checkpoints), "--env", env_id]
+    words += ["--realism", realism] if realism != CLEAN else []
+    words += ["--camera", str(camera)] if camera is not None else []
     return shlex.join([*words, "--episodes", str(episodes), "--seed", str(seed), "--out", str(out)])

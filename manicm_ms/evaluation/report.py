@@ -90,13 +90,56 @@ def paired_sentences(results: Mapping[str, Any]) -> list[str]:
 
 
 def crash_lines(results: Mapping[str, Any]) -> list[str]:
-    """Return one line per crashed episode."""
+    """Return one line per crashed episode, of all realism presets."""
+    entries = [(policy["name"], policy["episodes"]) for policy in results["policies"]]
+    for row in results.get("realism", {"rows": []})["rows"]:
+        if row["preset"] != results["realism"]["presets"][0]:  # those of the first stand among the policies
+            entries.append((f"{row['policy']} under {row['preset']}", row["episodes"]))
     return [
-        f"{policy['name']}, seed {episode['seed']}: {episode['crashed']}"
-        for policy in results["policies"]
-        for episode in policy["episodes"]
+        f"{name}, seed {episode['seed']}: {episode['crashed']}"
+        for name, episodes in entries
+        for episode in episodes
         if episode["crashed"] is not None
     ]
+
+
+class RealismRow(NamedTuple):
+    """One policy under one realism preset, formatted for people."""
+
+    preset: str
+    policy: str
+    success: str
+    interval: str
+    difference: str
+    p: str
+
+
+def realism_headers(results: Mapping[str, Any]) -> tuple[str, ...]:
+    """Return the headers of `realism_rows`."""
+    return ("Realism", "Policy", "Success", "95 % interval", f"Against {results['realism']['reference']}", "p")
+
+
+def realism_rows(results: Mapping[str, Any]) -> list[RealismRow]:
+    """Return one formatted row per preset and policy where several presets were played, else nothing."""
+    realism = results.get("realism")
+    return [_realism_row(row) for row in realism["rows"]] if realism and len(realism["presets"]) > 1 else []
+
+
+def _realism_row(row: Mapping[str, Any]) -> RealismRow:
+    (low, high), pair = row["ci95"], row["against_reference"]
+    difference, p = "", ""
+    if pair is not None:
+        least, most = (100 * bound for bound in pair["difference_ci95"])
+        difference = f"{100 * pair['difference']:+.1f} points ({least:+.1f} to {most:+.1f})"
+        p = f"{pair['mcnemar_p']:.3g}"
+    success = f"{row['successes']}/{row['n']} = {100 * row['success_rate']:.1f} %"
+    return RealismRow(row["preset"], row["policy"], success, f"{100 * low:.1f} to {100 * high:.1f} %", difference, p)
+
+
+def realism_sentence(results: Mapping[str, Any]) -> str:
+    """Return under which preset the main results were obtained; nothing in the ideal world."""
+    realism = results.get("realism")
+    return f"Realism preset of these episodes: {realism['presets'][0]}." if realism else ""
 
 
 _PRINTED = ("name", "nfe", "success", "interval", "median", "p95")
@@ -112,6 +155,19 @@ def summary_table(results: Mapping[str, Any]) -> Table:
     for row in rows(results):
         table.add_row(*(getattr(row, key) for key in _PRINTED))
     return table
+
+
+def summary_tables(results: Mapping[str, Any]) -> list[Table]:
+    """Return the tables that the command line prints: that of the policies, and that of the realism presets if any."""
+    tables = [summary_table(results)]
+    if rows_ := realism_rows(results):
+        table = Table(title="the same seeds under each realism preset")
+        for header in realism_headers(results):
+            table.add_column(header, justify="left" if header in ("Realism", "Policy") else "right", overflow="fold")
+        for row in rows_:
+            table.add_row(*row)
+        tables.append(table)
+    return tables
 
 
 def render_markdown(results: Mapping[str, Any]) -> str:
@@ -224,7 +280,9 @@ def _context(results: Mapping[str, Any]) -> dict[str, Any]:
         "results": results,
         "headers": _HEADERS,
         "rows": rows(results),
-        "sentences": paired_sentences(results),
+        "sentences": [*filter(None, [realism_sentence(results)]), *paired_sentences(results)],
+        "realism_headers": realism_headers(results) if "realism" in results else (),
+        "realism_rows": realism_rows(results),
         "crashes": crash_lines(results),
         "format_ms": format_ms,
         "paper": PAPER_LATENCY_MS,

@@ -28,14 +28,14 @@ def contenders():
 
 
 def run(out, *, request=None, crash_at=None, made=None, videos=2, seeds=SEEDS, film_env=PointMass):
-    def for_policy(policy, n):
+    def for_policy(policy, n, preset):
         env = PointMass(n, policy.chunk, crash_at=crash_at)
         if made is not None:
             made.append(env)
         return env
 
     protocol = Protocol(SPEC.env_id, seeds, num_envs=4, repetitions=3, videos=videos)
-    envs = EnvMaker(for_policy, lambda n: film_env(n, chunk=None))
+    envs = EnvMaker(for_policy, lambda n, preset: film_env(n, chunk=None))
     console = Console(file=io.StringIO(), width=160)
     results = judge(contenders(), protocol, envs, out, request or {"seed": 100}, COMMAND, console)
     return results, console.file.getvalue()
@@ -195,7 +195,7 @@ def test_ctrl_c_while_filming_leaves_results_and_report(tmp_path, monkeypatch):
 
 def test_a_policy_alone_is_judged_without_a_pair(tmp_path):
     protocol = Protocol(SPEC.env_id, SEEDS[:4], num_envs=2, repetitions=1, videos=0)
-    envs = EnvMaker(lambda policy, n: PointMass(n, policy.chunk), lambda n: PointMass(n, chunk=None))
+    envs = EnvMaker(lambda policy, n, _: PointMass(n, policy.chunk), lambda n, _: PointMass(n, chunk=None))
     results = judge(contenders()[:1], protocol, envs, tmp_path / "r", {}, COMMAND, Console(file=io.StringIO()))
     assert results["paired"] is None
     assert "On the same" not in render_markdown(results)
@@ -204,7 +204,7 @@ def test_a_policy_alone_is_judged_without_a_pair(tmp_path):
 def test_names_cannot_break_the_page(tmp_path):
     hostile = dataclasses.replace(contenders()[0], name="<script>alert(1)</script>")
     protocol = Protocol(SPEC.env_id, SEEDS[:2], num_envs=2, repetitions=1, videos=1)
-    envs = EnvMaker(lambda policy, n: PointMass(n, policy.chunk), lambda n: PointMass(n, chunk=None))
+    envs = EnvMaker(lambda policy, n, _: PointMass(n, policy.chunk), lambda n, _: PointMass(n, chunk=None))
     judge([hostile], protocol, envs, tmp_path / "r", {}, COMMAND, Console(file=io.StringIO()))
     assert "<script>" not in (tmp_path / "r" / "report.html").read_text()
 
