@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 import torch
@@ -25,7 +26,31 @@ from manicm_ms.robots.limits import (
 from manicm_ms.robots.limits import quat_multiply as multiply
 
 
-class LimitedPoseController(PDEEPoseController):
+class _RowwiseReset:
+    """Resets a controller in the rows that begin an episode, and leaves the targets of the others alone.
+
+    ManiSkill (3.0.1) resets controllers when `scene._reset_mask` covers every row again. In rows whose episode goes on,
+    targets would fall back to what is measured: the arm would stop short, and fingers would let go of what they hold.
+
+    Attributes:
+        beginning: (N,) bool, rows that begin an episode; set by the agent and used up by the next reset. None: all.
+    """
+
+    beginning: Tensor | None = None
+    scene: Any
+
+    def reset(self) -> None:
+        """Take what is measured as the target, in the rows that begin."""
+        every_row = self.scene._reset_mask
+        if self.beginning is not None:
+            self.scene._reset_mask = self.beginning
+        try:
+            super().reset()  # type: ignore[misc]
+        finally:
+            self.scene._reset_mask, self.beginning = every_row, None
+
+
+class LimitedPoseController(_RowwiseReset, PDEEPoseController):
     """Turns end-effector actions (N, 6) into joint targets that stay inside the workspace and the joints' speeds.
 
     An action is a translation and a rotation vector, both in the robot-base frame, each component in [-1, 1] of the
@@ -138,7 +163,7 @@ class LimitedPoseControllerConfig(PDEEPoseControllerConfig):
             )
 
 
-class OpeningController(PDJointPosController):
+class OpeningController(_RowwiseReset, PDJointPosController):
     """Commands the opening of a two-finger gripper (N, 1): the distance between the pads, metres.
 
     An action of -1 asks for `lower`, +1 for `upper` (width 0 and the full stroke); each finger takes half. The drives'

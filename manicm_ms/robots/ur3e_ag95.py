@@ -123,6 +123,12 @@ class UR3eAG95(BaseAgent):
         self._arm_columns = [order.index(name) for name in ARM_JOINTS]
         self._finger_columns = [order.index(name) for name in FINGER_JOINTS]
 
+    def reset(self, init_qpos: Tensor | None = None) -> None:
+        """Put the rows being reset to rest, at `init_qpos` (rows, 8) where it is given."""
+        super().reset(init_qpos)
+        for controller in self.controller.controllers.values():
+            controller.beginning = self.scene._reset_mask
+
     @property
     def _controller_configs(self) -> dict[str, DictControllerConfig]:
         arm = {
