@@ -9,6 +9,7 @@ from __future__ import annotations
 import argparse
 import os
 import platform
+import sys
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -30,10 +31,13 @@ import mani_skill.envs  # noqa: E402, F401  (registers PickCube-v1)
 from manicm_ms.envs.chunk import ActionChunk  # noqa: E402
 from manicm_ms.envs.maniskill import ManiSkillSimulator  # noqa: E402
 from manicm_ms.envs.simulator import ENVS, SimulatorConfig  # noqa: E402
-from manicm_ms.envs.vec_env import VecEnv, make_vec  # noqa: E402
+from manicm_ms.envs.vec_env import VecEnv, make_vec, resolve_backend  # noqa: E402
 from manicm_ms.envs.worker import RowEnv  # noqa: E402
+from manicm_ms.errors import ManicmError  # noqa: E402
 
-OUT = Path(__file__).resolve().parents[1] / "docs" / "results" / "env_speed.md"
+RESULTS = Path(__file__).resolve().parents[1] / "docs" / "results"
+PAGES = {"cpu": RESULTS / "env_speed.md", "gpu": RESULTS / "env_speed_gpu.md"}
+NUM_ENVS = {"cpu": [1, 2, 4], "gpu": [1, 16, 64, 256]}
 SIZE, STOCK_ID = 84, "PickCube-v1"
 SMALL = 0.3  # largest entry of the random actions
 WARM_UP_STEPS = 30
@@ -250,21 +254,44 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--env", default="ur3e/slide-block")
     parser.add_argument("--backend", choices=("cpu", "gpu"), default="cpu")
-    parser.add_argument("--num-envs", type=int, nargs="+", default=[1, 2, 4])
+    parser.add_argument("--num-envs", type=int, nargs="+", help=f"one run each; by default {NUM_ENVS}")
     parser.add_argument("--repetitions", type=int, default=9)
-    parser.add_argument("--write", action="store_true", help=f"write {OUT.name} in docs/results")
+    parser.add_argument("--write", action="store_true", help="write the page in docs/results, one for each backend")
     args = parser.parse_args()
+    try:
+        resolve_backend(args.backend)
+        measure(args.env, args.backend, args.num_envs or NUM_ENVS[args.backend], args.repetitions, args.write)
+    except ManicmError as error:
+        print(f"bench_env.py: {error}", file=sys.stderr)
+        sys.exit(2)
+
+
+def measure(env_id: str, backend: str, counts: list[int], repetitions: int, write: bool) -> None:
+    """Measure what `backend` allows, print the page, and write it where `write` says so."""
     torch.set_num_threads(1)  # as in a worker; more of them would fight the software renderer
     sections = {"Machine": f"At the start: {machine()}."}
-    if args.backend == "cpu":
-        sections["One worker against stock ManiSkill, in turn"] = bench_against_stock(args.env, args.repetitions)
-        sections["Where a worker's time goes"] = shares_table(shares(args.env, 400))
-    sections["In parallel"] = bench_rows(args.env, args.backend, args.num_envs, args.repetitions)
+    if backend == "cpu":
+        sections["One worker against stock ManiSkill, in turn"] = bench_against_stock(env_id, repetitions)
+        sections["Where a worker's time goes"] = shares_table(shares(env_id, 400))
+    sections["In parallel"] = bench_rows(env_id, backend, counts, repetitions)
     text = "\n\n".join(f"## {title}\n\n{body}" for title, body in sections.items())
     print(text)
-    if args.write:
-        OUT.parent.mkdir(parents=True, exist_ok=True)
-        OUT.write_text(_page(args.env, text), encoding="utf-8")
+    if write:
+        page = _page(env_id, text) if backend == "cpu" else _gpu_page(env_id, counts, text)
+        PAGES[backend].parent.mkdir(parents=True, exist_ok=True)
+        PAGES[backend].write_text(page, encoding="utf-8")
+
+
+def _gpu_page(env_id: str, counts: list[int], text: str) -> str:
+    return f"""# Speed of the environments on a GPU
+
+{env_id} at {SIZE}x{SIZE} pixels, cloud of 512 points and proprioception at every control step, small random actions,
+rows reset as their episodes end. All rows are simulated and rendered together in one process; every step is waited for.
+
+{text}
+
+Made by `python scripts/bench_env.py --backend gpu --num-envs {" ".join(map(str, counts))} --write`.
+"""
 
 
 def _page(env_id: str, text: str) -> str:
