@@ -52,8 +52,13 @@ STATE_LAYOUT = layout(**_FRAME_PARTS, **{f"previous_{name}": n for name, n in _F
 """The suite's goal-observable observation. "first" and "second" are the task's objects, the second often absent (0); a
 quaternion's order is the task's own."""
 
-# The table's top is z = 0. Left and right of it nothing stands; the arm's foot and the floor are cut away.
-WORKSPACE = Box((-0.7, 0.2, 0.005), (0.7, 1.1, 0.8))
+# The table's top is z = 0, and a ledge of 12 cm runs around it: what stands on it, and the arm above it, is kept.
+LOW, HIGH = (-0.675, 0.225, 0.005), (0.675, 0.975, 0.8)
+TABLE = (Box(LOW, HIGH),)
+# Another table, 5 cm higher and without the ledge, with a hole that holds the goal.
+TABLE_WITH_HOLE = (Box((*LOW[:2], 0.055), HIGH), Box((-0.079, 0.761, -0.045), (0.079, 0.919, 0.055)))
+# A slab of 5.4 cm on the table, and a pit in it where the object lies.
+TABLE_WITH_PIT = (Box((*LOW[:2], 0.059), HIGH), Box((-0.149, 0.651, 0.005), (0.149, 0.949, 0.059)))
 DP3_WORKSPACE = Box((-0.5, -1.5, -0.795), (1.0, -0.4, 100.0))
 
 
@@ -68,11 +73,12 @@ def _dp3_rotation() -> Any:
 DP3_VIEW = View(
     camera=CAMERA,
     pose=FixedPose(position=EYE),
-    workspace=DP3_WORKSPACE,
+    workspace=(DP3_WORKSPACE,),
     frame=Dp3Frame(_dp3_rotation()),
     size=(128, 128),
     pixel_centre=0.0,
     clip=(0.1, 1.5),
+    solid=False,
     sampler=sample_or_pad_with_zeros,
 )
 
@@ -80,14 +86,13 @@ DP3_VIEW = View(
 # ---- the table ------------------------------------------------------------------------------------------------
 
 
-def _task(name: str, group: str, benchmark: bool = False, table_top: float = 0.0) -> MujocoTask:
-    low = (*WORKSPACE.low[:2], WORKSPACE.low[2] + table_top)
+def _task(name: str, group: str, benchmark: bool = False, workspace: tuple[Box, ...] = TABLE) -> MujocoTask:
     return MujocoTask(
         env_id=f"metaworld/{name}",
         suite_id=f"{name}-v3",
         group=group,
         views={
-            MANICM_MS: View(CAMERA, Box(low, WORKSPACE.high), FixedPose(EYE, UPRIGHT)),
+            MANICM_MS: View(CAMERA, workspace, FixedPose(EYE, UPRIGHT)),
             DP3: DP3_VIEW,
         },
         video=(CAMERA, FixedPose(EYE, UPRIGHT)),
@@ -145,10 +150,10 @@ TASKS = (
     _task("push-wall", MEDIUM),
     _task("soccer", MEDIUM, benchmark=True),
     _task("sweep", MEDIUM),
-    _task("sweep-into", MEDIUM, benchmark=True),
+    _task("sweep-into", MEDIUM, benchmark=True, workspace=TABLE_WITH_HOLE),
     _task("assembly", HARD),
-    _task("hand-insert", HARD, benchmark=True),
-    _task("pick-out-of-hole", HARD, benchmark=True),
+    _task("hand-insert", HARD, benchmark=True, workspace=TABLE_WITH_HOLE),
+    _task("pick-out-of-hole", HARD, benchmark=True, workspace=TABLE_WITH_PIT),
     _task("pick-place", HARD, benchmark=True),
     _task("push", HARD),
     _task("push-back", HARD),

@@ -101,7 +101,7 @@ class MujocoSimulator(Simulator):
         self._video_camera = task.video
         size = self._view.size or config.image_size
         largest = [max(sides) for sides in zip(size, config.image_size, VIDEO_SIZE, strict=True)]
-        self._renderer = LeanRenderer(env.model, (largest[0], largest[1]))
+        self._renderer = LeanRenderer(env.model, (largest[0], largest[1]), self._view.solid)
         self._rays = _pixel_rays(size, env.model.cam_fovy[self._camera], self._view.pixel_centre)
         self._cloud_size = size
         self._seed = -1
@@ -168,10 +168,11 @@ class MujocoSimulator(Simulator):
         ).astype(np.float32)
         hit = np.flatnonzero(picture.hit)
         xyz = self._rays[hit] * picture.depth.reshape(-1, 1)[hit]
-        index, points = crop_transformed(xyz, T_cloud_camera, self._view.workspace)
+        parts = [crop_transformed(xyz, T_cloud_camera, box) for box in self._view.workspace]
+        points = np.concatenate([inside for _, inside in parts])
         if self.config.colors:
-            rgb = picture.image.reshape(-1, 3)[hit[index]] / np.float32(255)
-            points = np.concatenate([points, rgb], axis=1)
+            pixels = hit[np.concatenate([index for index, _ in parts])]
+            points = np.concatenate([points, picture.image.reshape(-1, 3)[pixels] / np.float32(255)], axis=1)
         return self._view.sampler(points, self.config.num_points)
 
     def render_video_frames(self) -> Tensor:

@@ -56,10 +56,15 @@ class LeanRenderer:
     Args:
         model: its render quality is lowered.
         largest: (H, W) of the largest picture that will be asked for, pixels.
+        solid: draw translucent geoms and sites solid, as `mujoco.Renderer` does for its depth images. OpenGL blends
+            what is translucent into the colour and leaves it out of the depth.
     """
 
-    def __init__(self, model: mujoco.MjModel, largest: tuple[int, int]) -> None:
+    def __init__(self, model: mujoco.MjModel, largest: tuple[int, int], solid: bool = True) -> None:
         self._model = model
+        if solid:
+            for rgba in (model.geom_rgba, model.mat_rgba, model.site_rgba):
+                rgba[(rgba[:, 3] > 0) & (rgba[:, 3] < 1), 3] = 1
         self._buffer = max(model.vis.global_.offheight, largest[0]), max(model.vis.global_.offwidth, largest[1])
         model.vis.global_.offheight, model.vis.global_.offwidth = self._buffer
         model.vis.quality.offsamples = 0

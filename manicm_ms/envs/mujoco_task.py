@@ -118,22 +118,24 @@ class View:
 
     Attributes:
         camera: the model's camera that looks.
-        workspace: what is kept of the cloud, in `frame`.
+        workspace: what is kept of the cloud, in `frame`: what lies in one of these boxes, which do not overlap.
         pose: where the camera is put.
         frame: the cloud's frame.
         size: (H, W) that the cloud is rendered at, pixels; None: that of the images.
         pixel_centre: where a pixel's centre lies in it: 0.5, or 0 as the public DP3 code has it.
         clip: near and far plane, in units of the model's extent; None leaves them as the model has them.
+        solid: draw translucent things solid; else their depth is that of what shines through them.
         sampler: makes the cloud of P points from those in the workspace.
     """
 
     camera: str
-    workspace: Box
+    workspace: tuple[Box, ...]
     pose: FixedPose = FixedPose()
     frame: CloudFrame = WorldFrame()
     size: tuple[int, int] | None = None
     pixel_centre: float = 0.5
     clip: tuple[float, float] | None = None
+    solid: bool = True
     sampler: Sampler = sample_cloud
 
 
