@@ -73,6 +73,7 @@ class Export:
             "task": self.task,
             "seeds": self.store.seeds.tolist(),
             "success": self.store.successes.tolist(),
+            "realism": {"names": list(self.store.realism_names), "values": self.store.realism.tolist()},
         }
 
     def require_space(self) -> None:

@@ -1,7 +1,8 @@
 """To ManiSkill's h5 and json: what its replay_trajectory, its baselines and its data loaders read.
 
 A store holds what a policy sees, ManiSkill's file what the simulator was in; so each episode is played
-again from its seed, and one that is not solved again (it came from another backend, say) is left out.
+again from its seed, and one that is not solved again (it came from another backend, say, or its masses
+were randomised, of which the plain environment knows nothing) is left out.
 """
 
 from __future__ import annotations
@@ -51,6 +52,8 @@ def export(job: Export) -> Tally:
         )
     write_json(job.folder / SIDECAR, job.about())
     tally.notes.append(f"played again: agent_pos differs from the store's by at most {gap:.2g}")
+    if (realism := provenance.get("realism", "clean")) != "clean":
+        tally.notes.append(f"collected with realism {realism!r}: the states written are those of the plain simulator")
     if failed:
         tally.notes.append(f"{len(failed)} episodes were not solved again and are left out: seeds {failed}")
     return tally
