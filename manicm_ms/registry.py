@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import importlib
+import os
 import pkgutil
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Sequence
+from pathlib import Path
 from typing import Any, Generic, TypeVar
 
-from manicm_ms.errors import DuplicateNameError, UnknownNameError
+from manicm_ms.errors import ConfigError, DuplicateNameError, UnknownNameError
 
 T = TypeVar("T")
 
@@ -79,3 +81,29 @@ class Registry(Generic[T]):
         package, self._package = importlib.import_module(self._package), None
         for module in pkgutil.iter_modules(package.__path__):
             importlib.import_module(f"{package.__name__}.{module.name}")
+
+
+def outside_folders(variable: str, beside: Sequence[str]) -> list[str]:
+    """Return the folders that the environment variable names (separated as those of PATH), for a package's `__path__`.
+
+    Processes started later inherit the variable, so that they find the same modules.
+
+    Args:
+        variable: name of the environment variable; unset or empty names no folder.
+        beside: folders that the package has already.
+
+    Raises:
+        ConfigError: one is no folder, or holds a module whose name is taken, which would never be imported.
+    """
+    folders = [str(Path(name).resolve()) for name in os.environ.get(variable, "").split(os.pathsep) if name]
+    known = {module.name: module.module_finder.path for module in pkgutil.iter_modules(list(beside))}  # type: ignore[union-attr]
+    for folder in folders:
+        if not Path(folder).is_dir():
+            raise ConfigError(f"{variable} names {folder}, which is no folder: correct or unset it")
+        for module in pkgutil.iter_modules([folder]):
+            if module.name in known:
+                raise ConfigError(
+                    f"{variable}: {folder} holds {module.name}.py, and so does {known[module.name]}: rename one of them"
+                )
+            known[module.name] = folder
+    return folders
