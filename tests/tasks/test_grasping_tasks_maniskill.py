@@ -86,7 +86,7 @@ def test_a_carried_object_is_not_yet_a_success(task, env):
 @pytest.mark.parametrize("kind", ["no-op", "random"])
 def test_idle_and_random_policies_do_not_succeed(task, env, kind):
     rng = np.random.default_rng(0)
-    for seed in range(2):
+    for seed in range(1 if kind == "no-op" else 2):
         env.reset(seed=seed)
         for _ in range(task.MAX_EPISODE_STEPS):
             action = np.zeros(7) if kind == "no-op" else rng.uniform(-1, 1, 7)
