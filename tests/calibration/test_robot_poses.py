@@ -67,7 +67,7 @@ def test_errors_name_file_image_and_field(tmp_path, content, match):
 
 def test_two_poses_for_one_image_and_a_csv_without_names(tmp_path):
     twice = "file,x,y,z,rx,ry,rz\na.png,0,0,0,0,0,0\na.png,0,0,0,0,0,0\n"
-    with pytest.raises(CalibrationError, match="two poses for a.png"):
+    with pytest.raises(CalibrationError, match=r"two poses for a\.png"):
         read_poses(written(tmp_path, twice, "poses.csv"))
     with pytest.raises(CalibrationError, match="its header is x,y,z"):
         read_poses(written(tmp_path, "x,y,z\n0,0,0\n", "poses.csv"))
