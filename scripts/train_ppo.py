@@ -1,7 +1,8 @@
 """Trains PPO (Stable-Baselines3, extra `rl`) on a task's dense reward from privileged state, and draws its curve.
 
-python scripts/train_ppo.py train --seed 0                          # writes runs/ppo/0
-python scripts/train_ppo.py report runs/ppo/0 runs/ppo/1            # a table, and docs/images/ppo_slide_block.png
+python scripts/train_ppo.py train --seed 0        # writes runs/ppo/0: settings, curve, weights
+python scripts/train_ppo.py judge runs/ppo/0      # plays fresh seeds, beside random actions, idling and the expert
+python scripts/train_ppo.py report runs/ppo/0     # a table, and docs/images/ppo_slide_block.png
 
 After every few updates the policy plays episodes of its own; curve and weights are written then, so that a stopped run
 (Ctrl-C, --minutes) keeps all it had done. It is not continued: `train` begins anew, in a folder that must not exist.
@@ -42,7 +43,9 @@ from manicm_ms.training.interrupt import StopRequest, stop_requests
 from manicm_ms.types import STATE, ChunkSpec
 
 PICTURE = Path(__file__).resolve().parents[1] / "docs" / "images" / "ppo_slide_block.png"
-CURVE, WEIGHTS, RESULT = "curve.json", "policy.safetensors", "result.json"
+SETTINGS, CURVE, WEIGHTS, SCORES = "settings.json", "curve.json", "policy.safetensors", "scores.json"
+REFERENCES = {"expert": "--", "random actions": ":", "idle": "-."}
+"""Whom PPO is compared with, and the line that each is drawn with."""
 TRAINING_SEEDS = 1_000_000  # training of seed s plays episodes from (s + 1) times this; what is judged starts at 0
 FINAL_SEEDS = 10_000  # first seed of the episodes that judge the trained policy; those of the curve start at 0
 
@@ -70,7 +73,6 @@ class Train:
         rows: worker processes.
         eval_every: control steps between two points of the curve.
         eval_episodes: of each point; the same seeds at every point.
-        final_episodes: that judge the trained policy, random actions, idling and the expert.
         minutes: stop after so long; None for never.
         out: folder of the run; None for runs/ppo/<seed>.
     """
@@ -81,14 +83,26 @@ class Train:
     rows: int = 2
     eval_every: int = 8_000
     eval_episodes: int = 10
-    final_episodes: int = 50
     minutes: float | None = None
     out: Path | None = None
 
 
 @dataclass(frozen=True)
+class Judge:
+    """Play fresh seeds with a trained policy, random actions, no actions and the expert.
+
+    Attributes:
+        run: folder of the run.
+        episodes: of each player, the same seeds.
+    """
+
+    run: tyro.conf.Positional[Path]
+    episodes: int = 50
+
+
+@dataclass(frozen=True)
 class Report:
-    """Print a table of finished runs and draw their curves.
+    """Print a table of judged runs and draw their curves.
 
     Attributes:
         runs: their folders.
@@ -269,13 +283,13 @@ class CurveCallback(BaseCallback):
         self._evaluate()
 
     def _on_step(self) -> bool:
-        self._progress.update(self._task, completed=self.num_timesteps)
+        self._progress.update(self._task, completed=HELD * self.num_timesteps)
         limit = self._args.minutes
         late = limit is not None and time.monotonic() - self._began > 60 * limit
         return not (self._stop.asked or late)
 
     def _on_rollout_start(self) -> None:  # the update that used the last roll-out has been done
-        if self.num_timesteps - self._points[-1]["steps"] >= self._args.eval_every:
+        if HELD * self.num_timesteps - self._points[-1]["steps"] >= self._args.eval_every:
             self._evaluate()
 
     def _on_training_end(self) -> None:
@@ -286,61 +300,61 @@ class CurveCallback(BaseCallback):
         """Add a point to the curve, and write curve and weights."""
         save_policy(self._out / WEIGHTS, self.model, self._normal)  # type: ignore[arg-type]  # made by `train`
         score = play(self._judge, Held(load_player(self._out / WEIGHTS, self._judge)), range(self._args.eval_episodes))
-        minutes = (time.monotonic() - self._began) / 60
-        self._points.append({"steps": self.num_timesteps, "minutes": round(minutes, 2), **asdict(score)})
+        minutes, steps = (time.monotonic() - self._began) / 60, HELD * self.num_timesteps
+        self._points.append({"steps": steps, "minutes": round(minutes, 2), **asdict(score)})
         write_json(self._out / CURVE, self._points)
         self._progress.console.print(
-            f"{self.num_timesteps} steps, {minutes:.1f} min: return {score.mean_return:.3f}, "
+            f"{steps} control steps, {minutes:.1f} min: return {score.mean_return:.3f}, "
             f"success {score.successes}/{score.episodes}"
         )
 
 
 def train(args: Train) -> None:
-    """Train, judge what was trained against random actions, idling and the expert, and write all of it."""
+    """Train, and write curve and weights as they come."""
     out = args.out or Path("runs") / "ppo" / str(args.seed)
     if out.exists():
         raise ConfigError(f"{out} exists: choose another --out, or remove it")
     out.mkdir(parents=True)
     held = ChunkSpec(horizon=HELD, n_obs_steps=1, n_action_steps=HELD)
-    training, judge = (
+    settings = {k: str(v) if isinstance(v, Path) else v for k, v in asdict(args).items()}
+    write_json(out / SETTINGS, settings | {"ppo": PPO_SETTINGS, "network": NETWORK, "versions": package_versions()})
+    training, playing = (
         make_vec(args.env, args.rows, "cpu", obs=(STATE,), chunk=chunk, reward_mode="normalized_dense")
         for chunk in (held, None)
     )
-    try:
-        with stop_requests() as stop:
-            minutes, steps = _learn(args, out, training, judge, stop)
-        scores = _judge_all(args, out, judge)
-    finally:
-        training.close()
-        judge.close()
-    versions = package_versions()
-    settings = {k: str(v) if isinstance(v, Path) else v for k, v in asdict(args).items()}
-    learnt = {"steps": steps, "minutes": round(minutes, 1)}
-    write_json(out / RESULT, {"settings": settings, **learnt, "scores": scores, "versions": versions})
-    print(json.dumps(scores, indent=2))
-
-
-def _learn(args: Train, out: Path, training: VecEnv, judge: VecEnv, stop: StopRequest) -> tuple[float, int]:
-    """Run PPO; return the minutes that it took, judging included, and the control steps played."""
     rows = AbsorbingSuccess(VecMonitor(StableBaselinesEnv(training)), GAMMA, largest=HELD)
     # Rewards are scaled by the spread of the discounted return, and not clipped: a success is far from the others.
     normal = VecNormalize(rows, clip_obs=CLIP_OBS, clip_reward=np.inf, gamma=GAMMA, epsilon=STD_FLOOR)
     model = PPO("MlpPolicy", normal, seed=args.seed, device="cpu", policy_kwargs=NETWORK, **PPO_SETTINGS)
     normal.seed((args.seed + 1) * TRAINING_SEEDS)  # PPO passes its own seed, which the judged episodes have too
-    began = time.monotonic()
-    model.learn(args.steps, callback=CurveCallback(args, out, judge, normal, stop))
-    return (time.monotonic() - began) / 60, model.num_timesteps
+    try:
+        with stop_requests() as stop:
+            model.learn(args.steps // HELD, callback=CurveCallback(args, out, playing, normal, stop))
+    finally:
+        training.close()
+        playing.close()
 
 
-def _judge_all(args: Train, out: Path, judge: VecEnv) -> dict[str, dict[str, Any]]:
-    players: dict[str, Player] = {
-        "ppo": Held(load_player(out / WEIGHTS, judge)),
-        "random actions": Held(RandomPlayer(judge.env_spec.action.dim, args.seed)),
-        "idle": IdlePlayer(judge.env_spec.action.dim),
-        "expert": ExpertPlayer(judge),
-    }
-    seeds = range(FINAL_SEEDS, FINAL_SEEDS + args.final_episodes)
-    return {name: asdict(play(judge, player, seeds)) for name, player in players.items()}
+def judge(args: Judge) -> None:
+    """Write the scores of a trained policy and of those that it is compared with."""
+    if not (args.run / WEIGHTS).is_file():
+        raise ConfigError(f"{args.run} holds no {WEIGHTS}: give the folder of a run of 'train'")
+    settings = json.loads((args.run / SETTINGS).read_text(encoding="utf-8"))
+    env = make_vec(settings["env"], settings["rows"], "cpu", obs=(STATE,), reward_mode="normalized_dense")
+    dim = env.env_spec.action.dim
+    seeds = range(FINAL_SEEDS, FINAL_SEEDS + args.episodes)
+    try:
+        players: dict[str, Player] = {
+            "PPO": Held(load_player(args.run / WEIGHTS, env)),
+            "expert": ExpertPlayer(env),
+            "random actions": Held(RandomPlayer(dim, settings["seed"])),
+            "idle": IdlePlayer(dim),
+        }
+        scores = {name: asdict(play(env, player, seeds)) for name, player in players.items()}
+    finally:
+        env.close()
+    write_json(args.run / SCORES, scores)
+    print(json.dumps(scores, indent=2))
 
 
 # ---- the report -----------------------------------------------------------------------------------------------
@@ -348,14 +362,17 @@ def _judge_all(args: Train, out: Path, judge: VecEnv) -> dict[str, dict[str, Any
 
 def report(args: Report) -> None:
     """Print a Markdown table of the runs and draw the picture."""
-    results = [json.loads((run / RESULT).read_text(encoding="utf-8")) for run in args.runs]
+    settings, curves, scores = (
+        [json.loads((run / name).read_text(encoding="utf-8")) for run in args.runs]
+        for name in (SETTINGS, CURVE, SCORES)
+    )
+    labels = [f"PPO, seed {s['seed']}" for s in settings]
     print("| player | mean normalised return | success | 95 % interval | control steps played |\n|---|---|---|---|---|")
-    for result in results:
-        print(_row(f"PPO, seed {result['settings']['seed']}, {result['steps']} steps", result["scores"]["ppo"]))
-    for name in ("random actions", "idle", "expert"):
-        print(_row(name, results[0]["scores"][name]))
-    curves = [json.loads((run / CURVE).read_text(encoding="utf-8")) for run in args.runs]
-    _draw(results, curves, args.picture)
+    for label, curve, score in zip(labels, curves, scores, strict=True):
+        print(_row(f"{label}, after {curve[-1]['steps']} control steps", score["PPO"]))
+    for name in REFERENCES:
+        print(_row(name, scores[0][name]))
+    _draw(labels, curves, scores[0], args.picture)
 
 
 def _row(name: str, score: dict[str, Any]) -> str:
@@ -364,20 +381,20 @@ def _row(name: str, score: dict[str, Any]) -> str:
     return f"| {name} | {score['mean_return']:.3f} | {success} | {score['mean_steps']:.0f} |"
 
 
-def _draw(results: list[dict[str, Any]], curves: list[list[dict[str, Any]]], picture: Path) -> None:
-    """Draw return and success rate against control steps; levels of the other players as lines."""
+def _draw(labels: list[str], curves: list[list[dict[str, Any]]], others: dict[str, Any], picture: Path) -> None:
+    """Draw return and success rate against control steps; those of the other players as lines."""
     import matplotlib
 
     matplotlib.use("Agg")
     from matplotlib import pyplot as plt
 
     figure, (left, right) = plt.subplots(1, 2, figsize=(10, 3.6), layout="constrained")
-    for result, curve in zip(results, curves, strict=True):
-        steps, label = [point["steps"] for point in curve], f"PPO, seed {result['settings']['seed']}"
+    for label, curve in zip(labels, curves, strict=True):
+        steps = [point["steps"] for point in curve]
         left.plot(steps, [point["mean_return"] for point in curve], ".-", label=label)
         right.plot(steps, [point["successes"] / point["episodes"] for point in curve], ".-", label=label)
-    for name, style in (("expert", "--"), ("idle", "-."), ("random actions", ":")):
-        score = results[0]["scores"][name]
+    for name, style in REFERENCES.items():
+        score = others[name]
         left.axhline(score["mean_return"], color="black", linestyle=style, linewidth=1, label=name)
         right.axhline(score["successes"] / score["episodes"], color="black", linestyle=style, linewidth=1)
     episodes = curves[0][0]["episodes"]
@@ -392,10 +409,11 @@ def _draw(results: list[dict[str, Any]], curves: list[list[dict[str, Any]]], pic
 
 def main() -> None:
     """Parse the command line and run; one line for what a user can mend."""
-    args = tyro.cli(Train | Report)  # type: ignore[arg-type]  # tyro takes unions
+    run = {Train: train, Judge: judge, Report: report}
+    args = tyro.cli(Train | Judge | Report)  # type: ignore[arg-type,var-annotated]  # tyro takes unions
     try:
         with torch_threads(1):  # the workers need the cores
-            train(args) if isinstance(args, Train) else report(args)
+            run[type(args)](args)
     except ManicmError as error:
         sys.exit(f"error: {error}")
 
