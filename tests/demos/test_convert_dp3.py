@@ -144,6 +144,8 @@ FRAMES = sum(LENGTHS)
         ({}, {"colors": True}, ConfigError, "no colours"),
         ({}, {"num_points": 0}, ConfigError, "num_points"),
         ({}, {"env": None, "frame": "camera"}, ConfigError, "camera"),
+        ({}, {"env": None, "control_hz": 0.0}, ConfigError, "control_hz must be positive"),
+        ({}, {"frame": "world"}, ConfigError, "leave them out"),
     ],
 )
 def test_what_does_not_fit_is_refused(tmp_path, changes, options, error, match):

@@ -26,6 +26,7 @@ from manicm_ms.provenance import package_versions
 from manicm_ms.types import ActionSpec, EnvSpec, ObsSpec, require_compatible
 
 _ACTION_SLACK = 1e-5  # of rounding, beyond [-1, 1]
+_FRAME, _CONTROL_HZ = "world", 10.0
 _PICTURES = {"image": "img", "depth": "depth"}
 
 
@@ -37,23 +38,25 @@ class Dp3Options:
         env: registered environment id that the data is of; None makes a spec from the store's shapes.
         num_points: P, points kept of each cloud; None for what the environment has, or the store.
         colors: keep rgb, where the store has it.
-        frame: frame of the clouds where `env` is None, one of `types.FRAMES`.
-        control_hz: actions per second where `env` is None.
+        frame: frame of the clouds, one of `types.FRAMES`, only where `env` is None; "world" if not given.
+        control_hz: actions per second, only where `env` is None; 10 if not given.
         command: command line, for the provenance.
     """
 
     env: str | None = None
     num_points: int | None = None
     colors: bool = False
-    frame: str = "world"
-    control_hz: float = 10.0
+    frame: str | None = None
+    control_hz: float | None = None
     command: str = ""
 
     def __post_init__(self) -> None:
         if self.num_points is not None and self.num_points < 1:
             raise ConfigError(f"num_points must be at least 1, got {self.num_points}")
-        if self.control_hz <= 0:
+        if self.control_hz is not None and self.control_hz <= 0:
             raise ConfigError(f"control_hz must be positive, got {self.control_hz}")
+        if self.env is not None and (self.frame is not None or self.control_hz is not None):
+            raise ConfigError(f"frame and control_hz are those of {self.env}: leave them out, or leave out env")
 
 
 @IMPORTERS.register("dp3")
@@ -185,8 +188,8 @@ def _spec_of_shapes(raw: _RawStore, asked: Dp3Options) -> EnvSpec:
     dim, action_dim = raw.arrays["agent_pos"].shape[1], raw.arrays["action"].shape[1]
     return EnvSpec(
         env_id=f"dp3/{raw.path.name.removesuffix('.zarr')}",
-        obs=ObsSpec(raw.arrays["point_cloud"].shape[1], 3, dim, asked.frame),
-        action=ActionSpec(tuple(f"action_{k}" for k in range(action_dim)), "unknown", asked.control_hz),
+        obs=ObsSpec(raw.arrays["point_cloud"].shape[1], 3, dim, asked.frame or _FRAME),
+        action=ActionSpec(tuple(f"action_{k}" for k in range(action_dim)), "unknown", asked.control_hz or _CONTROL_HZ),
         max_episode_steps=int(np.diff(raw.ends, prepend=0).max()),
         agent_pos_names=tuple(f"state_{k}" for k in range(dim)),
     )
