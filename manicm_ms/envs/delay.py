@@ -39,3 +39,8 @@ class ActionDelay:
         """Take the actions (n, Da) of this step; return those that arrive in it (n, Da)."""
         self._queue = torch.cat([actions[:, None], self._queue[:, :-1]], dim=1)
         return torch.gather(self._queue, 1, self._delay)[:, 0]
+
+    def pending(self) -> Tensor:
+        """Return the sum of the actions that were given and have not arrived yet, (n, Da)."""
+        age = torch.arange(self._queue.shape[1], device=self._queue.device)[:, None]
+        return (self._queue * (age < self._delay)).sum(dim=1)

@@ -24,7 +24,7 @@ from manicm_ms.envs.ur3e_tabletop import UR3eTabletopEnv  # noqa: E402
 from manicm_ms.envs.views import CameraView, IdealView, View  # noqa: E402
 from manicm_ms.errors import ConfigError, RenderDeviceError  # noqa: E402
 from manicm_ms.realism import RealismRows  # noqa: E402
-from manicm_ms.robots.ur3e_ag95 import opening_to_action  # noqa: E402
+from manicm_ms.robots.ur3e_ag95 import TCP_STEP, opening_to_action  # noqa: E402
 from manicm_ms.types import AGENT_POS, DEPTH, IMAGE, POINT_CLOUD, STATE, EnvSpec  # noqa: E402
 
 VIDEO_SHADER = "default"
@@ -125,10 +125,21 @@ class ManiSkillSimulator(Simulator):
         if AGENT_POS in wanted:
             frame[AGENT_POS] = self.env.agent_pos()
         if STATE in wanted:
-            frame[STATE] = self.env.privileged_state()
+            frame[STATE] = self._state()
         if pictures:
             frame |= self._view.frame(wanted, self._pictures(self._view.needs_color(wanted)), self._steps)
         return frame
+
+    def _state(self) -> Tensor:
+        """Return the privileged state (n, S). Its target pose is where commands still under way will move the target.
+
+        An expert plans from the target: blind to what is under way it would give every late command twice.
+        """
+        state = self.env.privileged_state()
+        if self._delay is not None:
+            start, _ = self.spec.state_layout["tcp_target_pose"]
+            state[:, start : start + 3] += TCP_STEP * self._delay.pending()[:, :3]
+        return state
 
     def _shoot(self) -> None:
         """Start rendering the present scene; `_pictures` waits for it."""

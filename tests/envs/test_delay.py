@@ -18,6 +18,8 @@ def test_each_component_of_each_row_comes_as_late_as_it_should():
         for row in range(n):
             for j in range(dim):
                 given = k - int(delay[row, j])
+                under_way = actions[max(given + 1, 0) : k + 1, row, j].sum() + resting[row, j] * max(-given - 1, 0)
+                torch.testing.assert_close(queue.pending()[row, j], under_way)
                 assert played[row, j] == (actions[given, row, j] if given >= 0 else resting[row, j])
 
 
