@@ -3,6 +3,8 @@
 MuJoCo reads MUJOCO_GL while it is imported and, left alone, takes GLFW, which needs a screen. `prepare` sets it to the
 first that this machine has: EGL (a GPU's, or Mesa's software renderer), else OSMesa, else "disabled": physics then
 works and rendering raises RenderDeviceError. A choice that the user made stays.
+
+Run as a module, it ends with status 0 where EGL opens without a screen, else 1.
 """
 
 from __future__ import annotations
@@ -59,7 +61,7 @@ def prepare() -> str:
     if named in _LIBRARIES and not _library(*_LIBRARIES[named]):
         raise RenderDeviceError(f"{VARIABLE}={named}, but {_LIBRARIES[named][0]} is not here: unset it; {REMEDY}")
     if not named:
-        named = "egl" if _egl_initialises() else "osmesa" if _library(*_LIBRARIES["osmesa"]) else DISABLED
+        named = "egl" if _egl_works() else "osmesa" if _library(*_LIBRARIES["osmesa"]) else DISABLED
         os.environ[VARIABLE] = named
     return named
 
@@ -101,6 +103,12 @@ def _library(*names: str) -> ctypes.CDLL | None:
     return None
 
 
+def _egl_works() -> bool:
+    """Ask a process of its own: a driver that was opened here might not survive a fork, and one that crashes none."""
+    asked = subprocess.run([sys.executable, "-m", "manicm_ms.mujoco_gl"], capture_output=True, check=False)
+    return asked.returncode == 0
+
+
 def _egl_initialises() -> bool:
     """Return whether some EGL device opens without a screen, asked the way MuJoCo does."""
     egl = _library(*_LIBRARIES["egl"])
@@ -120,3 +128,7 @@ def _egl_initialises() -> bool:
         return False
     displays = (display_of(_EGL_PLATFORM_DEVICE, device, None) for device in devices[: count.value])
     return any(display and egl.eglInitialize(display, None, None) for display in displays)
+
+
+if __name__ == "__main__":
+    sys.exit(0 if _egl_initialises() else 1)

@@ -186,12 +186,12 @@ class AdroitEnv:
 
     def __init__(self, task: AdroitTask, preset: str) -> None:
         require_suite("gymnasium-robotics")
-        import mujoco
+        from manicm_ms.envs.mujoco import update_derived  # imports mujoco
 
         module, name = task.env_class.split(".")
         with redirect_stderr(StringIO()):  # the package prints a notice about rewards when it is imported
             suite = importlib.import_module(f"gymnasium_robotics.envs.adroit_hand.{module}")
-        self._task, self._forward = task, mujoco.mj_forward
+        self._task, self._update = task, update_derived
         self._env = getattr(suite, name)()
         self._is_success = suite_success if preset == MANICM_MS else task.dp3_success
         self.model: mujoco.MjModel = self._env.model
@@ -203,7 +203,7 @@ class AdroitEnv:
         """See `SuiteEnv.reset`."""
         self._env.reset(seed=seed)
         self._last_success = False
-        self._forward(self.model, self.data)
+        self._update(self.model, self.data)
 
     def step(self, action: NDArray[np.float64]) -> Outcome:
         """See `SuiteEnv.step`; the fact "success_last_two" is DP3's figure: the mean over two control steps."""
@@ -215,7 +215,7 @@ class AdroitEnv:
             dropped = self._dropped()
             if dropped:
                 break
-        self._forward(self.model, self.data)
+        self._update(self.model, self.data)
         success, before = successes[-1], self._last_success
         self._last_success = success
         return Outcome(success, dropped, reward, sum(successes), {"success_last_two": (success + before) / 2})
@@ -262,6 +262,7 @@ for _row in TASKS:
             backends=("cpu",),
             obs_presets=(MANICM_MS, DP3),
             has_realism=False,
+            preload=("manicm_ms.envs.mujoco", "gymnasium.envs.mujoco.mujoco_env"),
         ),
         tags=_row.tags,
         former=_row.former_names,

@@ -181,10 +181,11 @@ class MetaWorldEnv:
 
     def __init__(self, task: MujocoTask) -> None:
         require_suite("metaworld")
-        import mujoco
         from metaworld.env_dict import ALL_V3_ENVIRONMENTS_GOAL_OBSERVABLE
 
-        self._forward = mujoco.mj_forward
+        from manicm_ms.envs.mujoco import update_derived  # imports mujoco
+
+        self._update = update_derived
         make: Any = ALL_V3_ENVIRONMENTS_GOAL_OBSERVABLE[f"{task.suite_id}-goal-observable"]
         self._env = make(seed=0)  # any seed: without one, building draws from NumPy's global generator
         self._env._freeze_rand_vec = False
@@ -197,7 +198,7 @@ class MetaWorldEnv:
         """See `SuiteEnv.reset`."""
         self._env.seed(seed)
         self._env.reset()
-        self._forward(self.model, self.data)  # the suite moves the goal's marker in the model and leaves it at that
+        self._update(self.model, self.data)  # the suite moves the goal's marker in the model and leaves it at that
         self._previous = self._env._prev_obs = self._env._get_curr_obs_combined_no_goal()
 
     def step(self, action: NDArray[np.float64]) -> Outcome:
@@ -250,6 +251,7 @@ for _row in TASKS:
             backends=("cpu",),
             obs_presets=(MANICM_MS, DP3),
             has_realism=False,
+            preload=("manicm_ms.envs.mujoco", "metaworld.env_dict"),
         ),
         tags=_row.tags,
         former=_row.former_names,

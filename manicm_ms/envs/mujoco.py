@@ -26,10 +26,21 @@ _FULL_STATE = mujoco.mjtState.mjSTATE_INTEGRATION
 _MODEL_ARRAYS = ("body_pos", "body_quat", "site_pos")  # what the suites' resets write into the model
 
 
+def update_derived(model: mujoco.MjModel, data: mujoco.MjData) -> None:
+    """Bring positions, cameras and sensors up to date with the joints (mj_forward), and change nothing that moves on.
+
+    mj_forward leaves its accelerations as the solver's next starting point (qacc_warmstart), from which the next step
+    would part from the suite's own by 1e-9; that is put back.
+    """
+    warmstart = data.qacc_warmstart.copy()
+    mujoco.mj_forward(model, data)
+    data.qacc_warmstart[:] = warmstart
+
+
 class SuiteEnv(Protocol):
     """A suite's environment, reduced to what the simulator needs.
 
-    After `reset` and `step` the kinematics of `data` are up to date (mj_forward): what is rendered is where it is.
+    After `reset` and `step`, `data` is up to date (`update_derived`): what is rendered is where it is.
 
     Attributes:
         model, data: MuJoCo's.
@@ -222,7 +233,7 @@ class MujocoSimulator(Simulator):
         for name in _MODEL_ARRAYS:
             getattr(model, name)[:] = saved[name]
         mujoco.mj_setState(model, data, saved["integration"], _FULL_STATE)
-        mujoco.mj_forward(model, data)
+        update_derived(model, data)
         prefix = "suite_"
         self.env.restore({k.removeprefix(prefix): value for k, value in saved.items() if k.startswith(prefix)})
 

@@ -1,4 +1,4 @@
-"""Adroit and Meta-World through `make_vec`: the promises, some tasks of each suite, and what cannot be asked of them."""
+"""Adroit and Meta-World through `make_vec`: the promises on some tasks of each, and what cannot be asked of them."""
 
 import subprocess
 import sys
@@ -80,9 +80,9 @@ def test_names_that_are_not_ours(asked, answer):
 
 
 def test_adroit_has_no_normalised_reward():
-    with closing(make_vec("adroit/door", obs=(AGENT_POS,), reward_mode="normalized_dense")) as env:
-        with pytest.raises(ConfigError, match="its dense reward has no bounds"):
-            env.reset(seed=[1])
+    env = make_vec("adroit/door", obs=(AGENT_POS,), reward_mode="normalized_dense")
+    with closing(env), pytest.raises(ConfigError, match="its dense reward has no bounds"):
+        env.reset(seed=[1])
 
 
 def test_without_opengl_physics_works_and_rendering_says_what_to_do(monkeypatch):
@@ -104,7 +104,8 @@ if __name__ == "__main__":
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     first, second = done.stdout.strip().splitlines()
     assert first == "torch.Size([1, 39])"
-    assert second.startswith("no OpenGL to render with") and "make setup" in second
+    assert second.startswith("no OpenGL to render with")
+    assert "make setup" in second
     assert RenderDeviceError.__name__ not in done.stderr
 
 
@@ -112,7 +113,9 @@ def test_listing_loads_neither_simulator():
     code = "import sys; from manicm_ms.cli import listing; listing.envs('metaworld'); print(sorted(sys.modules))"
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert "'manicm_ms.tasks.metaworld'" in done.stdout
-    assert not {"'mujoco'", "'metaworld'", "'gymnasium_robotics'", "'OpenGL'"} & set(done.stdout.strip("[]\n").split(", "))
+    assert not {"'mujoco'", "'metaworld'", "'gymnasium_robotics'", "'OpenGL'"} & set(
+        done.stdout.strip("[]\n").split(", ")
+    )
 
 
 def test_reward_modes():
