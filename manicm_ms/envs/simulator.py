@@ -139,6 +139,7 @@ class EnvEntry:
         backends: where it can be simulated: "cpu", "gpu" or both.
         obs_presets: those of `OBS_PRESETS` that it has.
         has_realism: whether it knows realism presets and camera files.
+        preload: modules that take long to import and that worker processes may share; a missing one is no error.
     """
 
     spec: EnvSpec
@@ -148,6 +149,7 @@ class EnvEntry:
     backends: tuple[str, ...] = ("cpu", "gpu")
     obs_presets: tuple[str, ...] = ("manicm_ms",)
     has_realism: bool = True
+    preload: tuple[str, ...] = ()
 
     def require(self, config: SimulatorConfig) -> None:
         """Raise ConfigError where `config` asks for what this environment does not have."""

@@ -157,7 +157,7 @@ class CpuVecEnv(VecEnv):
     ) -> None:
         super().__init__(spec, num_envs, config.obs, chunk)
         self.device = torch.device("cpu")
-        multiprocessing.get_context(_START_METHOD).set_forkserver_preload([__name__, entry.module])
+        multiprocessing.get_context(_START_METHOD).set_forkserver_preload([__name__, entry.module, *entry.preload])
         make = functools.partial(RowEnv, spec.env_id, entry.module, config, chunk)
         self._workers = AsyncVectorEnv(
             [make] * num_envs, context=_START_METHOD, autoreset_mode=AutoresetMode.DISABLED, copy=False
