@@ -12,6 +12,7 @@ import argparse
 import json
 from dataclasses import asdict, dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch
@@ -181,11 +182,12 @@ def run(env_id: str, style: str, seeds: range, records: Path) -> list[EpisodeMot
 def _read(records: Path) -> list[EpisodeMotion]:
     """Return the episodes on disk, but for a line that a kill cut short."""
     lines = records.read_text(encoding="utf-8").splitlines() if records.exists() else []
-    entries = [json.loads(line) for line in lines if line.endswith("}")]
-    return [
-        EpisodeMotion(**{name: np.array(v) if isinstance(v, list) else v for name, v in entry.items()})
-        for entry in entries
-    ]
+    return [_episode(json.loads(line)) for line in lines if line.endswith("}")]
+
+
+def _episode(entry: dict[str, Any]) -> EpisodeMotion:
+    values: dict[str, Any] = {name: np.array(v) if isinstance(v, list) else v for name, v in entry.items()}
+    return EpisodeMotion(**values)
 
 
 def _cut_short(records: Path) -> bool:

@@ -26,6 +26,10 @@ PAGE, DATA = RESULTS / "real_world.md", RESULTS / "data" / "real_world.json"
 SEED = 200_000
 SOURCE = 'ManiCM, arXiv:2406.01586, table "Real World Experiment Results"'
 PAPER_TRIALS = 10
+_KEPT = (
+    "role", "checkpoint", "nfe", "n", "successes", "success_rate", "ci95", "crashed", "latency_ms", "device", "threads",
+    "dtype", "parameters",
+)  # fmt: skip
 ROLES = {"teacher": "DP3", "student": "ManiCM"}
 
 
@@ -87,9 +91,7 @@ def play(task: str, pair: list[Path], episodes: int, seed: int, out: Path, comma
 
     named = [folder.relative_to(Path.cwd()) if folder.is_relative_to(Path.cwd()) else folder for folder in pair]
     results = evaluate(named, TASKS[task].env_id, episodes, seed, out / task, control=False, videos=0, command=command)
-    kept = ("role", "checkpoint", "nfe", "n", "successes", "success_rate", "ci95", "crashed", "latency_ms", "device")
-    kept += ("threads", "dtype", "parameters")
-    policies = [{key: policy[key] for key in kept} for policy in results["policies"]]
+    policies = [{key: policy[key] for key in _KEPT} for policy in results["policies"]]
     shared = {key: results[key] for key in ("env_id", "paired", "machine", "versions")}
     return shared | {"seeds": [results["seeds"][0], results["seeds"][-1]], "policies": policies}
 
