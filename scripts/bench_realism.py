@@ -99,9 +99,9 @@ def page(results: Mapping[str, Mapping[str, Tally]], options: Options) -> str:
         "# Realism presets: what they cost, and the expert under them",
         "",
         f"{options.episodes} seeds from {options.seed} on, every frame rendered, one process, one torch thread of",
-        f"{platform.machine()}, torch {torch.__version__}, load {os.getloadavg()[0]:.1f} on {os.cpu_count()} cores. CPU time",
-        "counts the software renderer's threads and hardly depends on the load; steps/s by the clock do. A cloud's points",
-        "are the different ones among its 512, in the first frame of an episode: mean.",
+        f"{platform.machine()}, torch {torch.__version__}, load {os.getloadavg()[0]:.1f} on {os.cpu_count()} cores.",
+        "CPU time counts the renderer's threads and hardly depends on the load; steps/s by the clock do. A cloud's",
+        "points are the different ones among its 512, in the first frame of an episode: mean.",
         "",
         "| task | preset | expert | CPU time a step | steps/s | points at the start |",
         "|---|---|---|---|---|---|",
@@ -112,7 +112,7 @@ def page(results: Mapping[str, Mapping[str, Tally]], options: Options) -> str:
                 f"| {env_id} | {name} | {tally.successes}/{options.episodes} | {1e3 * tally.cpu / tally.steps:.1f} ms "
                 f"| {tally.steps / tally.wall:.0f} | {sum(tally.seen) / len(tally.seen):.0f} |"
             )
-    words = "" if options == Options(write=True) else " ".join(["", *_changed(options)])
+    words = " ".join(["", *_changed(options)])
     return "\n".join([*lines, "", f"Made by `python scripts/bench_realism.py{words} --write`.", ""])
 
 
