@@ -30,6 +30,11 @@ class Box(NamedTuple):
     low: tuple[float, float, float]
     high: tuple[float, float, float]
 
+    def raised(self, floor: float) -> Box:
+        """Return the same box, cut off below the height `floor`, m."""
+        x, y, z = self.low
+        return Box((x, y, max(z, floor)), self.high)
+
 
 def transform(points: Tensor, T_out_in: Tensor) -> Tensor:
     """Map points (..., M, 3) by homogeneous transforms (..., 4, 4) from frame `in` to frame `out`."""

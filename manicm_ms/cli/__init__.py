@@ -204,6 +204,7 @@ def cloud_command(
     camera: Path,
     out: Path,
     env: str = "ur3e/slide-block",
+    realism: str = "d435i",
     num_points: int = 512,
 ) -> None:
     """Turn a recorded depth image into the cloud that a policy sees, exactly as the simulator makes its own.
@@ -213,11 +214,12 @@ def cloud_command(
         camera: camera file of the cell, as 'manicm-ms calibrate' writes it.
         out: where to write the points, metres, robot-base frame: NAME.ply or NAME.npy.
         env: environment whose workspace box crops the cloud.
+        realism: preset whose crop floor applies; a real camera's errors lift the table above that of clean.
         num_points: points wanted.
     """
     from manicm_ms.cli.cloud import cloud
 
-    cloud(depth, camera, out, env, num_points)
+    cloud(depth, camera, out, env, realism, num_points)
 
 
 def calibrate_command(

@@ -11,25 +11,27 @@ from numpy.typing import NDArray
 
 from manicm_ms.camera_model import depth_to_cloud, read_camera, read_depth
 from manicm_ms.errors import ConfigError
+from manicm_ms.realism import resolve_realism
 
 
-def cloud(depth: Path, camera: Path, out: Path, env: str, num_points: int) -> None:
+def cloud(depth: Path, camera: Path, out: Path, env: str, realism: str, num_points: int) -> None:
     """Write the cloud of a recorded depth image and say what became of its readings.
 
     Raises:
         CameraError: camera file or depth image cannot be used.
         ConfigError: `out` has another ending than .ply or .npy, or `num_points` is not positive.
-        UnknownNameError: no such environment.
+        UnknownNameError: no such environment or realism preset.
     """
     if out.suffix not in _WRITERS:
         raise ConfigError(f"cannot write {out}: name a file that ends in {' or '.join(_WRITERS)}")
     if num_points < 1:
         raise ConfigError(f"--num-points must be at least 1, got {num_points}")
+    crop_floor = resolve_realism(realism).crop_floor
     model = read_camera(camera)
     readings = model.cropped(read_depth(depth, model))
     from manicm_ms.envs.depth_clouds import workspace_of  # seconds of a simulator's import: errors of files come first
 
-    box = workspace_of(env)
+    box = workspace_of(env).raised(crop_floor)
     points = depth_to_cloud(readings[None], model, box, num_points)[0].numpy()
     distinct = len(np.unique(points, axis=0)) if points.any() else 0
     _WRITERS[out.suffix](out, points)

@@ -112,8 +112,9 @@ class CameraView(View):
         self, env: UR3eTabletopEnv, config: SimulatorConfig, camera: CameraModel, device: torch.device | str
     ) -> None:
         self._config, self._camera = config, camera
+        workspace = env.workspace.raised(config.realism.crop_floor)
         self._clouds = DepthClouds(
-            camera, config.realism.depth, env.workspace, config.num_points, config.num_rows,
+            camera, config.realism.depth, workspace, config.num_points, config.num_rows,
             colors=config.colors, size=config.image_size, device=device,
         )  # fmt: skip
         sampled = zip((camera.crop.height, camera.crop.width), config.image_size, strict=True)

@@ -20,7 +20,8 @@ from manicm_ms.point_cloud import Box
 from manicm_ms.realism import REALISM, RealismRows, believed_poses, true_cameras
 from manicm_ms.types import DEPTH, POINT_CLOUD
 
-WORKSPACE = Box((0.15, -0.25, 0.003), (0.50, 0.25, 0.15))  # of ur3e/slide-block
+# Of ur3e/slide-block under d435i: the crop floor of 12 mm; and under clean.
+WORKSPACE, IDEAL_WORKSPACE = (Box((0.15, -0.25, floor), (0.50, 0.25, 0.15)) for floor in (0.012, 0.003))
 
 
 @pytest.fixture
@@ -47,11 +48,11 @@ def told(capsys):
     return run
 
 
-def expected(folder, num_points=512):
+def expected(folder, num_points=512, workspace=WORKSPACE):
     camera = read_camera(folder / "camera.yaml")
     raw = cv2.imread(str(folder / "depth.png"), cv2.IMREAD_UNCHANGED)[89 : 89 + 302, 169 : 169 + 302]
     depth = torch.from_numpy(raw.astype(np.float32) * np.float32(0.001))
-    return depth_to_cloud(depth[None], camera, WORKSPACE, num_points)[0].numpy()
+    return depth_to_cloud(depth[None], camera, workspace, num_points)[0].numpy()
 
 
 def test_the_cloud_is_that_of_the_shared_function_to_the_bit(recording, told):
@@ -60,6 +61,14 @@ def test_the_cloud_is_that_of_the_shared_function_to_the_bit(recording, told):
     assert status == 0
     assert "512 points, 512 of them distinct" in said
     np.testing.assert_array_equal(np.load(out, allow_pickle=False), expected(recording))
+
+
+def test_realism_chooses_the_crop_floor(recording, told):
+    out = recording / "cloud.npy"
+    told(recording / "depth.png", "--camera", recording / "camera.yaml", "--out", out, "--realism", "clean")
+    points = np.load(out, allow_pickle=False)
+    np.testing.assert_array_equal(points, expected(recording, workspace=IDEAL_WORKSPACE))
+    assert points[:, 2].min() < 0.012 < expected(recording)[:, 2].min()
 
 
 def test_ply_holds_the_same_points(recording, told):
@@ -88,6 +97,7 @@ def test_a_camera_that_looks_elsewhere_is_pointed_out(recording, told):
         ({"depth": "gone.png"}, "gone.png does not exist"),
         ({"--camera": "gone.yaml"}, "gone.yaml does not exist"),
         ({"--env": "ur3e/slide-blok"}, "did you mean 'ur3e/slide-block'"),
+        ({"--realism": "d435"}, "did you mean 'd435i'"),
         ({"--out": "cloud.xyz"}, "ends in .ply or .npy"),
         ({"--num-points": "0"}, "at least 1"),
         ({"depth": "small.png"}, "small.png is 320x240 pixels"),
