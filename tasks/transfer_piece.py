@@ -21,6 +21,7 @@ from manicm_ms.demos.waypoints import Motion, WaypointFollower, smallest_turn, w
 from manicm_ms.envs.maniskill import ManiSkillSimulator
 from manicm_ms.envs.simulator import ENVS, EnvEntry
 from manicm_ms.envs.ur3e_tabletop import SPAWN_CLEARANCE, UR3eTabletopEnv, ur3e_spec
+from manicm_ms.point_cloud import Box
 from manicm_ms.robots.limits import pose_in_frame, quat_from_yaw, quat_rotate, yaw_of_quat
 from manicm_ms.robots.ur3e_ag95 import OPENING_MAX, TCP_STEP, TCP_TURN
 from manicm_ms.types import EnvSpec
@@ -43,6 +44,7 @@ BLUE, WOOD = (0.10, 0.25, 0.70, 1.0), (0.80, 0.66, 0.45, 1.0)
 BOX_LOWER, BOX_UPPER, BOX_YAW = (0.30, -0.02), (0.34, 0.02), np.deg2rad(5)  # m, rad
 PIECE_OFF, PIECE_YAW = (0.008, 0.015), np.deg2rad(10)  # m from the compartment's centre, box frame; rad
 
+CROP_FLOOR = FLOOR + 0.005  # m: the cloud starts above the box's floor, which is 3 mm high as the other tasks' crop
 LYING_HEIGHT = 0.030  # m: above it the piece's centre is on a wall or in the gripper
 TIP_LENGTH = 0.017  # m from the TCP to the fingertips
 TIP_CLEARANCE = 0.003  # m above the rim: the fingers have left the box
@@ -66,6 +68,7 @@ class TransferPieceEnv(UR3eTabletopEnv):
     # TCP at (0.30, 0, 0.25) m, tool down, the fingers closing along x.
     start_qpos: ClassVar[tuple[float, ...]] = (-0.452075, -1.507987, 0.854125, -0.916934, -1.570796, -2.022871)
     start_opening: ClassVar[float] = OPENING_MAX
+    workspace: ClassVar[Box] = UR3eTabletopEnv.workspace.raised(CROP_FLOOR)
     table_friction: ClassVar[float] = FRICTION
     reward_weights: ClassVar[dict[str, float]] = {
         "reach": 1.0, "grasp": 1.0, "carry": 2.0, "place": 1.0, "withdraw": 1.0
