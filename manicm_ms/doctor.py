@@ -19,7 +19,7 @@ from importlib import metadata
 from pathlib import Path
 from typing import Literal
 
-from manicm_ms import sapien_gpu, vulkan
+from manicm_ms import mujoco_gl, sapien_gpu, vulkan
 
 Status = Literal["ok", "warn", "fail"]
 
@@ -82,6 +82,20 @@ def check_vulkan() -> Finding:
             "install the graphics part of its driver (libGLX_nvidia; in a container the 'graphics' capability)",
         )
     return Finding("Vulkan device", "ok", outcome.device + (" (software rendering)" if software else ""))
+
+
+def check_mujoco() -> Finding:
+    """Render a tiny scene with MuJoCo, without a screen, in a process of its own."""
+    name = "MuJoCo OpenGL"
+    code = "from manicm_ms.envs.mujoco_task import require_suite as r; r('metaworld'); r('gymnasium-robotics')"
+    asked = _python(code)
+    if asked.returncode:
+        reason = asked.stderr.strip().splitlines()[-1].rpartition("Error: ")[2]
+        return Finding(name, "warn", f"Adroit and Meta-World cannot be played: {reason}", _REINSTALL)
+    outcome = mujoco_gl.probe()
+    if not outcome.works:
+        return Finding(name, "fail", outcome.reason.partition(";")[0], mujoco_gl.REMEDY)
+    return Finding(name, "ok", f"mujoco {_version('mujoco')}, {outcome.device}")
 
 
 def check_cuda() -> Finding:
@@ -179,8 +193,8 @@ def check_cpu() -> Finding:
 
 
 CHECKS: tuple[Callable[[], Finding], ...] = (
-    check_python, check_packages, check_vulkan, check_cuda, check_physx_gpu, check_opencv, check_mplib, check_cpu,
-    check_disk,
+    check_python, check_packages, check_vulkan, check_mujoco, check_cuda, check_physx_gpu, check_opencv,
+    check_mplib, check_cpu, check_disk,
 )  # fmt: skip
 
 

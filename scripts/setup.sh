@@ -1,5 +1,5 @@
 #!/usr/bin/env bash
-# Set-up: the environment .venv with the pinned dependencies, one OpenCV, and a Vulkan device that renders.
+# Set-up: the environment .venv with the pinned dependencies, one OpenCV, a Vulkan device and an OpenGL that render.
 #
 # Run by `make setup`, and by `make demo` and `make test` before their work. A second run finds the stamp and ends at
 # once; FORCE=1 looks at everything again. An interrupted run is repaired by the next one.
@@ -10,7 +10,7 @@ cd "$(dirname "$0")/.."
 VENV=.venv
 STAMP=$VENV/.setup-done           # holds the checksum of the inputs; written last
 INSTALLING=$VENV/.setup-installing # there while pip writes: a kill then may leave half a package behind
-INPUTS="setup.cfg pyproject.toml constraints.txt scripts/setup.sh scripts/setup_vulkan.py"
+INPUTS="setup.cfg pyproject.toml constraints.txt scripts/setup.sh scripts/setup_vulkan.py scripts/setup_mujoco.py"
 
 say() { echo "setup: $*"; }
 fail() { echo "setup: $*" >&2; exit 1; }
@@ -117,6 +117,7 @@ rm -f $STAMP
 if ! venv_works; then make_venv; fi
 install_packages
 $VENV/bin/python scripts/setup_vulkan.py $VENV/bin/python
+$VENV/bin/python scripts/setup_mujoco.py $VENV/bin/python
 { echo "$(inputs_sum) $PWD"; driver_file; } >$STAMP.new
 mv $STAMP.new $STAMP
 say "done"

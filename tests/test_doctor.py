@@ -48,6 +48,19 @@ def test_no_vulkan_device_fails_with_its_remedy_and_exit_status_1(tmp_path, monk
     assert "make setup" in printed
 
 
+def test_no_opengl_fails_and_a_refused_mujoco_warns(monkeypatch):
+    monkeypatch.setenv("MUJOCO_GL", "disabled")
+    finding = doctor.check_mujoco()
+    assert finding.status == "fail"
+    assert "no OpenGL" in finding.found
+    assert "make setup" in finding.remedy
+    answer = subprocess.CompletedProcess([], 1, "", "Trace\nmanicm_ms.errors.BackendError: metaworld needs another")
+    monkeypatch.setattr(doctor, "_python", lambda code: answer)
+    finding = doctor.check_mujoco()
+    assert finding.status == "warn"
+    assert finding.found == "Adroit and Meta-World cannot be played: metaworld needs another"
+
+
 def test_a_healthy_check_alone_gives_exit_status_0(monkeypatch, capsys):
     monkeypatch.setattr(doctor, "CHECKS", (doctor.check_python, doctor.check_disk))
     assert doctor.doctor() == 0

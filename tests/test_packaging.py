@@ -164,6 +164,7 @@ def test_no_package_host_is_named():
         "constraints.txt",
         "scripts/setup.sh",
         "scripts/setup_vulkan.py",
+        "scripts/setup_mujoco.py",
     ):
         assert "://" not in (REPO / name).read_text(), name
 

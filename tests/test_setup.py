@@ -6,6 +6,7 @@ import shutil
 import subprocess
 import sys
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 
@@ -108,7 +109,8 @@ def checkout(tmp_path) -> Path:
     """A copy of what set-up reads, with a stand-in for Python: set-up's own decisions are what is looked at here."""
     copy = tmp_path / "repo"
     (copy / "scripts").mkdir(parents=True)
-    for name in ("setup.cfg", "pyproject.toml", "constraints.txt", "scripts/setup.sh", "scripts/setup_vulkan.py"):
+    scripts = ("scripts/setup.sh", "scripts/setup_vulkan.py", "scripts/setup_mujoco.py")
+    for name in ("setup.cfg", "pyproject.toml", "constraints.txt", *scripts):
         shutil.copy(REPO / name, copy / name)
     stand_in = copy / "standin"
     stand_in.write_text(
@@ -142,6 +144,7 @@ def test_a_second_run_asks_nothing_of_python(checkout):
     assert status == 0
     assert "-m venv" in calls
     assert "setup_vulkan.py" in calls
+    assert "setup_mujoco.py" in calls
     assert run_setup(checkout) == (0, "")
     assert "install" in run_setup(checkout, FORCE="1")[1]
 
@@ -209,3 +212,49 @@ def test_an_unsuitable_python_is_refused(checkout, tmp_path):
     (tmp_path / "old").write_text("#!/bin/sh\nexit 1\n")
     (tmp_path / "old").chmod(0o755)
     assert run_setup(checkout, PYTHON=str(tmp_path / "old")) == (1, "")
+
+
+# ------------------------------------------------ MuJoCo's OpenGL
+
+
+@pytest.fixture
+def setup_mujoco(setup_vulkan, monkeypatch):
+    """The script as a module; apt and root are not touched."""
+    spec = importlib.util.spec_from_file_location("setup_mujoco", REPO / "scripts" / "setup_mujoco.py")
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    monkeypatch.setattr(module, "run", lambda command: "")
+    monkeypatch.setattr(module, "Apt", lambda: SimpleNamespace(update=lambda: None))
+    monkeypatch.setattr(module.shutil, "which", lambda name: f"/usr/bin/{name}")
+    return module
+
+
+def answers(monkeypatch, module, *found):
+    """Let the trial renderings answer `found` one after the other; return what is installed in between."""
+    left, installed = list(found), []
+    monkeypatch.setattr(module, "renderer", lambda python: left.pop(0))
+    monkeypatch.setattr(module, "install", installed.append)
+    return installed
+
+
+def test_an_opengl_that_renders_is_kept(setup_mujoco, monkeypatch):
+    installed = answers(monkeypatch, setup_mujoco, ("a GPU through egl", ""))
+    assert setup_mujoco.ensure_renderer("python") == "a GPU through egl"
+    assert installed == []
+
+
+def test_root_installs_egl_and_then_osmesa(setup_mujoco, monkeypatch):
+    monkeypatch.setattr(setup_mujoco.os, "geteuid", lambda: 0)
+    installed = answers(monkeypatch, setup_mujoco, ("", "no EGL"), ("", "still none"), ("llvmpipe through osmesa", ""))
+    assert setup_mujoco.ensure_renderer("python") == "llvmpipe through osmesa"
+    assert installed == [setup_mujoco.EGL, setup_mujoco.OSMESA]
+
+
+def test_without_root_it_says_what_to_ask_for_and_set_up_goes_on(setup_mujoco, monkeypatch, capsys):
+    monkeypatch.setattr(setup_mujoco.os, "geteuid", lambda: 1000)
+    installed = answers(monkeypatch, setup_mujoco, ("", "no OpenGL to render with; and so on"))
+    monkeypatch.setattr(sys, "argv", ["setup_mujoco.py", "python"])
+    assert setup_mujoco.main() == 0
+    assert installed == []
+    told = capsys.readouterr().out
+    assert "warning: Adroit and Meta-World will not render here: no OpenGL to render with: have libegl1" in told
