@@ -34,6 +34,9 @@ _REMEDIES = {
 }
 
 
+_FILE_WIDTH = 160  # columns of a table that is not read on a terminal
+
+
 def list_command(kind: tyro.conf.Positional[Literal["envs", "policies", "presets"]], tag: str | None = None) -> None:
     """List what is registered: environments, policies or training presets.
 
@@ -48,7 +51,10 @@ def list_command(kind: tyro.conf.Positional[Literal["envs", "policies", "presets
     if tag is not None and kind != "envs":
         raise ConfigError(f"--tag selects environments, {kind} have no tags: use 'list envs --tag {tag}' or drop --tag")
     tables = {"envs": lambda: listing.envs(tag), "policies": listing.policies, "presets": listing.presets}
-    Console().print(tables[kind]())
+    console = Console()
+    if not console.is_terminal:
+        console.width = max(console.width, _FILE_WIDTH)
+    console.print(tables[kind]())
 
 
 def check_command(env_ids: tyro.conf.Positional[tuple[str, ...]], backend: Backend = "auto") -> int:

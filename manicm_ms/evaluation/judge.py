@@ -6,7 +6,7 @@ import json
 import re
 import shlex
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import asdict, dataclass, replace
+from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
@@ -153,33 +153,42 @@ def evaluate(
         UnknownNameError, CheckpointError, SpecMismatchError, ConfigError, CameraError, OutputExistsError,
         NoSpaceError, BackendError.
     """
-    from manicm_ms.envs.simulator import ENVS
+    from manicm_ms.envs.simulator import ENVS, SimulatorConfig
     from manicm_ms.envs.vec_env import default_num_envs, resolve_backend
 
     device = str(resolve_device(device))
     if episodes < 1:
         raise ConfigError(f"--episodes must be at least 1, got {episodes}")
     rows = min(num_envs or default_num_envs(), episodes)
-    seeds, presets = tuple(range(seed, seed + episodes)), parse_presets(realism)
-    protocol = Protocol(env_id, seeds, rows, threads, repetitions, videos, presets)
+    seeds = tuple(range(seed, seed + episodes))
+    protocol = Protocol(env_id, seeds, rows, threads, repetitions, videos, parse_presets(realism))
     model = None if camera is None else read_camera(camera)
-    spec, backend = ENVS.get(env_id).spec, resolve_backend(backend)
+    entry = ENVS.get(env_id)
+    backend = resolve_backend(backend, entry)
+    for preset in protocol.realism:
+        entry.require(SimulatorConfig(realism=REALISM.get(preset), camera=model))
     contenders = load_contenders(checkpoints, device, control)
     for contender in contenders:
-        _require_made_for(spec, contender)
-
-    request = {
-        "env_id": env_id,
-        "seed": seed,
-        "episodes": episodes,
-        "backend": backend,
-        "device": device,
-        "policies": [[c.name, c.role, checkpoint_digest(c.checkpoint)] for c in contenders],
-        **_requested_realism(presets, model),
-    }
+        _require_made_for(entry.spec, contender)
+    request = _request(protocol, contenders, backend, device, model)
     command = command or _command(checkpoints, env_id, episodes, seed, out, realism, camera)
     envs = _env_maker(env_id, backend, model)
     return judge(contenders, protocol, envs, out, request, command, console or Console())
+
+
+def _request(
+    protocol: Protocol, contenders: Sequence[Contender], backend: str, device: str, camera: CameraModel | None
+) -> dict[str, Any]:
+    """Return what identifies an evaluation in its folder: an interrupted one goes on where all of it is the same."""
+    return {
+        "env_id": protocol.env_id,
+        "seed": protocol.seeds[0],
+        "episodes": len(protocol.seeds),
+        "backend": backend,
+        "device": device,
+        "policies": [[c.name, c.role, checkpoint_digest(c.checkpoint)] for c in contenders],
+        **_requested_realism(protocol.realism, camera),
+    }
 
 
 def _requested_realism(presets: tuple[str, ...], camera: CameraModel | None) -> dict[str, Any]:
@@ -188,7 +197,7 @@ def _requested_realism(presets: tuple[str, ...], camera: CameraModel | None) -> 
     if presets != (CLEAN,):
         requested["realism"] = [[name, REALISM.get(name).to_dict()] for name in presets]
     if camera is not None:
-        requested["camera"] = asdict(camera)
+        requested["camera"] = camera.to_dict()
     return requested
 
 
