@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from functools import partial
 from typing import ClassVar
 
@@ -13,14 +13,21 @@ from mani_skill.utils.registration import register_env
 from mani_skill.utils.structs import Actor, Pose
 from torch import Tensor
 
-from manicm_ms.demos.experts import EXPERTS, require_style
-from manicm_ms.demos.waypoints import Motion, WaypointFollower, waypoint_table
+from manicm_ms.demos.experts import EXPERTS
+from manicm_ms.demos.waypoints import Motion, Waypoint, WaypointExpert, over
 from manicm_ms.envs.maniskill import ManiSkillSimulator
 from manicm_ms.envs.simulator import ENVS, EnvEntry
-from manicm_ms.envs.ur3e_tabletop import SPAWN_CLEARANCE, UR3eTabletopEnv, pose_error, ur3e_spec
+from manicm_ms.envs.ur3e_tabletop import (
+    FINGERS_ALONG_X,
+    SPAWN_CLEARANCE,
+    STILL_SPEED,
+    STILL_TURN,
+    UR3eTabletopEnv,
+    pose_error,
+    ur3e_spec,
+)
 from manicm_ms.robots.limits import pose_in_frame, quat_from_yaw
 from manicm_ms.robots.ur3e_ag95 import OPENING_MAX, TCP_STEP, TCP_TURN
-from manicm_ms.types import EnvSpec
 
 ENV_ID, GYM_ID = "ur3e/slide-block", "UR3eSlideBlock-v1"
 MAX_EPISODE_STEPS = 120
@@ -33,8 +40,7 @@ CUBE_FRICTION, BLOCK_FRICTION, TABLE_FRICTION = 0.4, 0.2, 0.8  # material values
 WHITE, GREY = (0.92, 0.92, 0.90, 1.0), (0.35, 0.36, 0.38, 1.0)
 
 FALLEN_HEIGHT = 0.045  # m: below it the block's centre is no longer on the cube
-MAX_CUBE_SHIFT, MAX_CUBE_TILT = 0.02, np.deg2rad(10)
-STILL_SPEED, STILL_TURN = 0.01, 0.5  # m/s, rad/s
+MAX_CUBE_SHIFT, MAX_CUBE_TILT = 0.02, np.deg2rad(10)  # m, rad
 
 
 @register_env(GYM_ID, max_episode_steps=MAX_EPISODE_STEPS)
@@ -49,8 +55,7 @@ class SlideBlockEnv(UR3eTabletopEnv):
     the table.
     """
 
-    # TCP at (0.30, 0, 0.25) m, tool down, the fingers' flat sides facing +y and -y.
-    start_qpos: ClassVar[tuple[float, ...]] = (-0.452075, -1.507987, 0.854125, -0.916934, -1.570796, -2.022871)
+    start_qpos: ClassVar[tuple[float, ...]] = FINGERS_ALONG_X  # their flat sides face +y and -y
     start_opening: ClassVar[float] = 0.0
     table_friction: ClassVar[float] = TABLE_FRICTION
     reward_weights: ClassVar[dict[str, float]] = {"reach": 1.0, "push": 2.0, "fall": 1.0, "cube_in_place": 1.0}
@@ -131,45 +136,31 @@ FREE_SPEED, LOWER_SPEED, PUSH_SPEED, RETREAT_SPEED = 0.22, 0.12, 0.10, 0.15  # m
 
 
 @EXPERTS.register(ENV_ID)
-class SlideBlockExpert:
+class SlideBlockExpert(WaypointExpert):
     """Goes behind the block, lowers the closed fingers and pushes it over the edge.
 
-    Args:
-        spec: the environment's spec.
-        num_envs: N.
-        device: where states and actions live.
-        style: "one-sided" pushes towards +y; "two-sided" draws +y or -y for each episode from its seed.
+    Style "one-sided" pushes towards base +y, the robot's own left; "two-sided" draws +y or -y for each episode from
+    its seed.
     """
 
     name = "slide-block way-points"
     styles = ("one-sided", "two-sided")
+    motion = Motion(TCP_STEP, TCP_TURN, OPENING_MAX)
 
-    def __init__(self, spec: EnvSpec, num_envs: int, device: torch.device | str, style: str | None = None) -> None:
-        self.style = require_style(style, self.styles)
-        self._layout = spec.state_layout
-        motion = Motion(TCP_STEP, TCP_TURN, OPENING_MAX, control_hz=spec.action.control_hz)
-        self._follower = WaypointFollower(spec, num_envs, motion, device)
-
-    def reset(self, state: Tensor, seeds: Sequence[int], mask: Tensor) -> None:
-        """Plan the episodes of the rows in `mask` (N,) from their first state (N, S) and seeds (N)."""
-        start, _ = self._layout["block_pose"]
-        block = state[:, start : start + 3].double()
+    def plan(self, scene: Mapping[str, Tensor], seeds: Sequence[int]) -> list[Waypoint]:
+        """Return the way-points of N episodes from the parts of their first state, (N, width) each, and their seeds."""
+        block = scene["block_pose"]
         side = self._sides(seeds).to(block)  # (N,) +1 or -1
 
         def at(along: float, height: float) -> Tensor:
-            return torch.stack([block[:, 0], block[:, 1] + side * along, torch.full_like(side, height)], dim=1)
+            return over(torch.stack([block[:, 0], block[:, 1] + side * along], dim=1), height)
 
-        way = [
+        return [
             (at(-BEHIND, APPROACH_Z), 0.0, 0.0, FREE_SPEED, 0),
             (at(-BEHIND, PUSH_Z), 0.0, 0.0, LOWER_SPEED, 0),
             (at(BEYOND, PUSH_Z), 0.0, 0.0, PUSH_SPEED, 0),
             (at(BEYOND, RETREAT_Z), 0.0, 0.0, RETREAT_SPEED, 0),
         ]
-        self._follower.reset(waypoint_table(way, block), mask)
-
-    def act(self, state: Tensor) -> Tensor:
-        """Return the next action (N, 7) in [-1, 1] for the state (N, S)."""
-        return self._follower.act(state)
 
     def _sides(self, seeds: Sequence[int]) -> Tensor:
         if self.style == "one-sided":

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from functools import partial
 from typing import ClassVar
 
@@ -13,14 +13,21 @@ from mani_skill.utils.registration import register_env
 from mani_skill.utils.structs import Actor, Pose
 from torch import Tensor
 
-from manicm_ms.demos.experts import EXPERTS, require_style
-from manicm_ms.demos.waypoints import Motion, WaypointFollower, smallest_turn, waypoint_table
+from manicm_ms.demos.experts import EXPERTS
+from manicm_ms.demos.waypoints import Motion, Waypoint, WaypointExpert, over, smallest_turn
 from manicm_ms.envs.maniskill import ManiSkillSimulator
 from manicm_ms.envs.simulator import ENVS, EnvEntry
-from manicm_ms.envs.ur3e_tabletop import SPAWN_CLEARANCE, UR3eTabletopEnv, pose_error, ur3e_spec
+from manicm_ms.envs.ur3e_tabletop import (
+    FINGERS_ALONG_Y,
+    SPAWN_CLEARANCE,
+    STILL_SPEED,
+    STILL_TURN,
+    UR3eTabletopEnv,
+    pose_error,
+    ur3e_spec,
+)
 from manicm_ms.robots.limits import quat_from_yaw, yaw_of_quat
 from manicm_ms.robots.ur3e_ag95 import OPENING_MAX, TCP_STEP, TCP_TURN
-from manicm_ms.types import EnvSpec
 
 ENV_ID, GYM_ID = "ur3e/stack-cube", "UR3eStackCube-v1"
 MAX_EPISODE_STEPS = 200
@@ -37,8 +44,7 @@ MAX_YAW = np.deg2rad(30)
 _SPAWN_TRIES = 64  # about three of four pairs are far enough apart: all of them too close is out of the question
 
 MAX_OFFSET, MAX_HEIGHT_ERROR = 0.02, 0.005  # m: where the red cube counts as stacked
-MAX_WHITE_SHIFT, MAX_WHITE_TILT = 0.02, np.deg2rad(10)
-STILL_SPEED, STILL_TURN = 0.01, 0.5  # m/s, rad/s
+MAX_WHITE_SHIFT, MAX_WHITE_TILT = 0.02, np.deg2rad(10)  # m, rad
 
 
 @register_env(GYM_ID, max_episode_steps=MAX_EPISODE_STEPS)
@@ -52,8 +58,7 @@ class StackCubeEnv(UR3eTabletopEnv):
     has let go. **Failure**: the white cube was moved by 2 cm or tilted by 10 deg, or a cube fell off the table.
     """
 
-    # TCP at (0.30, 0, 0.25) m, tool down, the fingers closing along y.
-    start_qpos: ClassVar[tuple[float, ...]] = (-0.452075, -1.507987, 0.854125, -0.916934, -1.570796, -0.452075)
+    start_qpos: ClassVar[tuple[float, ...]] = FINGERS_ALONG_Y
     start_opening: ClassVar[float] = OPENING_MAX
     table_friction: ClassVar[float] = FRICTION
     reward_weights: ClassVar[dict[str, float]] = {
@@ -142,37 +147,18 @@ CLOSE_STEPS, OPEN_STEPS = 6, 4  # control steps that the fingers need; from long
 
 
 @EXPERTS.register(ENV_ID)
-class StackCubeExpert:
-    """Grasps the red cube along the sides nearest to the fingers, carries it over the white cube and sets it down.
-
-    Args:
-        spec: the environment's spec.
-        num_envs: N.
-        device: where states and actions live.
-        style: there is only "direct".
-    """
+class StackCubeExpert(WaypointExpert):
+    """Grasps the red cube along the sides nearest to the fingers, carries it over the white cube and sets it down."""
 
     name = "stack-cube way-points"
-    styles = ("direct",)
+    motion = Motion(TCP_STEP, TCP_TURN, OPENING_MAX)
 
-    def __init__(self, spec: EnvSpec, num_envs: int, device: torch.device | str, style: str | None = None) -> None:
-        self.style = require_style(style, self.styles)
-        self._layout = spec.state_layout
-        motion = Motion(TCP_STEP, TCP_TURN, OPENING_MAX, control_hz=spec.action.control_hz)
-        self._follower = WaypointFollower(spec, num_envs, motion, device)
-
-    def reset(self, state: Tensor, seeds: Sequence[int], mask: Tensor) -> None:
-        """Plan the episodes of the rows in `mask` (N,) from their first state (N, S) and seeds (N)."""
-        tcp, red, white = (
-            state[:, slice(*self._layout[name])].double() for name in ("tcp_pose", "red_pose", "white_pose")
-        )
+    def plan(self, scene: Mapping[str, Tensor], seeds: Sequence[int]) -> list[Waypoint]:
+        """Return the way-points of N episodes from the parts of their first state, (N, width) each, and their seeds."""
+        tcp, red, white = scene["tcp_pose"], scene["red_pose"], scene["white_pose"]
         quarter = torch.pi / 2  # a cube looks the same after it
         grasp = smallest_turn(yaw_of_quat(red[:, 3:]) - yaw_of_quat(tcp[:, 3:]), quarter)
-
-        def over(cube: Tensor, height: float) -> Tensor:
-            return torch.cat([cube[:, :2], torch.full_like(cube[:, :1], height)], dim=1)
-
-        way = [
+        return [
             (over(red, HOVER_Z), grasp, GRASP_OPENING, FREE_SPEED, 0),
             (over(red, GRASP_Z), grasp, GRASP_OPENING, LOWER_SPEED, 0),
             (over(red, GRASP_Z), grasp, 0.0, LOWER_SPEED, CLOSE_STEPS),
@@ -182,8 +168,3 @@ class StackCubeExpert:
             (over(white, PLACE_Z), grasp, RELEASE_OPENING, PLACE_SPEED, OPEN_STEPS),
             (over(white, RETREAT_Z), grasp, RELEASE_OPENING, LIFT_SPEED, 0),
         ]
-        self._follower.reset(waypoint_table(way, red), mask)
-
-    def act(self, state: Tensor) -> Tensor:
-        """Return the next action (N, 7) in [-1, 1] for the state (N, S)."""
-        return self._follower.act(state)

@@ -6,7 +6,7 @@ a camera in front of the table takes of the robot.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from functools import partial
 from typing import ClassVar
 
@@ -16,15 +16,21 @@ from mani_skill.utils.registration import register_env
 from mani_skill.utils.structs import Actor, Pose
 from torch import Tensor
 
-from manicm_ms.demos.experts import EXPERTS, require_style
-from manicm_ms.demos.waypoints import Motion, WaypointFollower, smallest_turn, waypoint_table
+from manicm_ms.demos.experts import EXPERTS
+from manicm_ms.demos.waypoints import Motion, Waypoint, WaypointExpert, over, smallest_turn
 from manicm_ms.envs.maniskill import ManiSkillSimulator
 from manicm_ms.envs.simulator import ENVS, EnvEntry
-from manicm_ms.envs.ur3e_tabletop import SPAWN_CLEARANCE, UR3eTabletopEnv, ur3e_spec
+from manicm_ms.envs.ur3e_tabletop import (
+    FINGERS_ALONG_X,
+    SPAWN_CLEARANCE,
+    STILL_SPEED,
+    STILL_TURN,
+    UR3eTabletopEnv,
+    ur3e_spec,
+)
 from manicm_ms.point_cloud import Box
 from manicm_ms.robots.limits import pose_in_frame, quat_from_yaw, quat_rotate, yaw_of_quat
 from manicm_ms.robots.ur3e_ag95 import OPENING_MAX, TCP_STEP, TCP_TURN
-from manicm_ms.types import EnvSpec
 
 ENV_ID, GYM_ID = "ur3e/transfer-piece", "UR3eTransferPiece-v1"
 MAX_EPISODE_STEPS = 180
@@ -48,7 +54,6 @@ CROP_FLOOR = FLOOR + 0.005  # m: the cloud starts above the box's floor, which i
 LYING_HEIGHT = 0.030  # m: above it the piece's centre is on a wall or in the gripper
 TIP_LENGTH = 0.017  # m from the TCP to the fingertips
 TIP_CLEARANCE = 0.003  # m above the rim: the fingers have left the box
-STILL_SPEED, STILL_TURN = 0.01, 0.5  # m/s, rad/s
 
 
 @register_env(GYM_ID, max_episode_steps=MAX_EPISODE_STEPS)
@@ -65,8 +70,7 @@ class TransferPieceEnv(UR3eTabletopEnv):
     **Failure**: the piece lies outside the box.
     """
 
-    # TCP at (0.30, 0, 0.25) m, tool down, the fingers closing along x.
-    start_qpos: ClassVar[tuple[float, ...]] = (-0.452075, -1.507987, 0.854125, -0.916934, -1.570796, -2.022871)
+    start_qpos: ClassVar[tuple[float, ...]] = FINGERS_ALONG_X
     start_opening: ClassVar[float] = OPENING_MAX
     workspace: ClassVar[Box] = UR3eTabletopEnv.workspace.raised(CROP_FLOOR)
     table_friction: ClassVar[float] = FRICTION
@@ -122,7 +126,8 @@ class TransferPieceEnv(UR3eTabletopEnv):
         place: it lies there. withdraw: there, the fingertips rise out of the box.
         """
         piece, box = self.piece.pose.p, self.box.pose.raw_pose
-        centre = box.new_tensor([[0.0, -COMPARTMENT_Y, FLOOR + PIECE_HALF[2]]]).expand(len(box), -1)
+        centre = box.new_tensor([[0.0, -COMPARTMENT_Y, FLOOR]]).repeat(len(box), 1)
+        centre[:, 2] += self.half_sizes["piece"][:, 2]
         goal = box[:, :3] + quat_rotate(box[:, 3:], centre)
         placed = info["placed"].float()
         held = torch.maximum(info["grasped"].float(), placed)
@@ -165,51 +170,27 @@ CLOSE_STEPS, OPEN_STEPS = 4, 3  # control steps that the fingers need; from long
 
 
 @EXPERTS.register(ENV_ID)
-class TransferPieceExpert:
-    """Half closes the gripper, lowers it around the piece, lifts it over the divider and sets it down beyond.
-
-    Args:
-        spec: the environment's spec.
-        num_envs: N.
-        device: where states and actions live.
-        style: there is only "direct".
-    """
+class TransferPieceExpert(WaypointExpert):
+    """Half closes the gripper, lowers it around the piece, lifts it over the divider and sets it down beyond."""
 
     name = "transfer-piece way-points"
-    styles = ("direct",)
+    motion = Motion(TCP_STEP, TCP_TURN, OPENING_MAX)
 
-    def __init__(self, spec: EnvSpec, num_envs: int, device: torch.device | str, style: str | None = None) -> None:
-        self.style = require_style(style, self.styles)
-        self._layout = spec.state_layout
-        motion = Motion(TCP_STEP, TCP_TURN, OPENING_MAX, control_hz=spec.action.control_hz)
-        self._follower = WaypointFollower(spec, num_envs, motion, device)
-
-    def reset(self, state: Tensor, seeds: Sequence[int], mask: Tensor) -> None:
-        """Plan the episodes of the rows in `mask` (N,) from their first state (N, S) and seeds (N)."""
-        tcp, box, piece = (
-            state[:, slice(*self._layout[name])].double() for name in ("tcp_pose", "box_pose", "piece_pose")
-        )
+    def plan(self, scene: Mapping[str, Tensor], seeds: Sequence[int]) -> list[Waypoint]:
+        """Return the way-points of N episodes from the parts of their first state, (N, width) each, and their seeds."""
+        tcp, box, piece = scene["tcp_pose"], scene["box_pose"], scene["piece_pose"]
         tool, quarter = yaw_of_quat(tcp[:, 3:]), torch.pi / 2  # the piece looks the same after a quarter turn
         grasp = smallest_turn(yaw_of_quat(piece[:, 3:]) - tool, quarter)
         place = smallest_turn(yaw_of_quat(box[:, 3:]) - tool, quarter)
         centre = box.new_tensor([[0.0, -COMPARTMENT_Y, 0.0]]).expand(len(box), -1)
         right = box[:, :3] + quat_rotate(box[:, 3:], centre)
-
-        def at(point: Tensor, height: float) -> Tensor:
-            return torch.cat([point[:, :2], torch.full_like(point[:, :1], height)], dim=1)
-
-        way = [
-            (at(piece, HOVER_Z), grasp, INSERT_OPENING, FREE_SPEED, 0),
-            (at(piece, GRASP_Z), grasp, INSERT_OPENING, LOWER_SPEED, 0),
-            (at(piece, GRASP_Z), grasp, 0.0, LOWER_SPEED, CLOSE_STEPS),
-            (at(piece, CARRY_Z), grasp, 0.0, LIFT_SPEED, 0),
-            (at(right, CARRY_Z), place, 0.0, FREE_SPEED, 0),
-            (at(right, PLACE_Z), place, 0.0, PLACE_SPEED, 0),
-            (at(right, PLACE_Z), place, RELEASE_OPENING, PLACE_SPEED, OPEN_STEPS),
-            (at(right, RETREAT_Z), place, RELEASE_OPENING, LIFT_SPEED, 0),
+        return [
+            (over(piece, HOVER_Z), grasp, INSERT_OPENING, FREE_SPEED, 0),
+            (over(piece, GRASP_Z), grasp, INSERT_OPENING, LOWER_SPEED, 0),
+            (over(piece, GRASP_Z), grasp, 0.0, LOWER_SPEED, CLOSE_STEPS),
+            (over(piece, CARRY_Z), grasp, 0.0, LIFT_SPEED, 0),
+            (over(right, CARRY_Z), place, 0.0, FREE_SPEED, 0),
+            (over(right, PLACE_Z), place, 0.0, PLACE_SPEED, 0),
+            (over(right, PLACE_Z), place, RELEASE_OPENING, PLACE_SPEED, OPEN_STEPS),
+            (over(right, RETREAT_Z), place, RELEASE_OPENING, LIFT_SPEED, 0),
         ]
-        self._follower.reset(waypoint_table(way, piece), mask)
-
-    def act(self, state: Tensor) -> Tensor:
-        """Return the next action (N, 7) in [-1, 1] for the state (N, S)."""
-        return self._follower.act(state)

@@ -1,4 +1,4 @@
-"""Batched way-point following: straight, smooth tool lines from privileged state, for scripted experts.
+"""Batched way-point following: straight, smooth tool lines from privileged state, and the experts made of them.
 
 Every row runs through its own way-points at its own pace with the same torch code, so one expert drives one row on a
 CPU or thousands on a GPU. No planner and no loop over rows.
@@ -6,12 +6,14 @@ CPU or thousands on a GPU. No planner and no loop over rows.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass
+from abc import ABC, abstractmethod
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
 
 import torch
 from torch import Tensor
 
+from manicm_ms.demos.experts import require_style
 from manicm_ms.types import EnvSpec
 
 # Commands are rounded to this grid: torch's vectorised and scalar paths differ in the last bit of sin, exp and the
@@ -168,13 +170,20 @@ def smallest_turn(angle: Tensor, period: float) -> Tensor:
     return torch.remainder(angle + period / 2, period) - period / 2
 
 
-def waypoint_table(
-    rows: Sequence[tuple[Tensor, Tensor | float, Tensor | float, float, int]], like: Tensor
-) -> Waypoints:
-    """Build `Waypoints` from one entry a way-point: (position (N, 3), yaw (N,), opening (N,), speed, dwell).
+def over(point: Tensor, height: float) -> Tensor:
+    """Return the positions (N, 3), m, at `height` m above (or below) `point` (N, 2 or more: x, y, ...)."""
+    return torch.cat([point[:, :2], torch.full_like(point[:, :1], height)], dim=1)
 
-    Yaw and opening may be plain numbers. `like` (N, ...) gives the device and N.
-    """
+
+Waypoint = tuple[Tensor, Tensor | float, Tensor | float, float, int]
+"""A line of a plan: position (N, 3), yaw (N,), opening (N,), speed, dwell; units and frames as in `Waypoints`.
+
+Yaw and opening may be plain numbers.
+"""
+
+
+def waypoint_table(rows: Sequence[Waypoint], like: Tensor) -> Waypoints:
+    """Build `Waypoints` from one entry a way-point; `like` (N, ...) gives the device and N."""
     n = len(like)
 
     def column(value: Tensor | float) -> Tensor:
@@ -187,3 +196,46 @@ def waypoint_table(
         speed=torch.tensor([speed for *_, speed, _ in rows], dtype=torch.float64, device=like.device),
         dwell=torch.tensor([dwell for *_, dwell in rows], device=like.device),
     )
+
+
+class WaypointExpert(ABC):
+    """An `Expert` that plans all way-points at the start of an episode; a task's own gives them in `plan`.
+
+    A class sets `name`, `motion` and, where it has more than one, `styles`.
+
+    Args:
+        spec: the environment's spec.
+        num_envs: N.
+        device: where states and actions live.
+        style: one of `styles`, the first of them for None.
+
+    Raises UnknownNameError for a style that is not there.
+    """
+
+    name: str
+    styles: tuple[str, ...] = ("direct",)
+    motion: Motion
+
+    def __init__(self, spec: EnvSpec, num_envs: int, device: torch.device | str, style: str | None = None) -> None:
+        self.style = require_style(style, self.styles)
+        self._layout = spec.state_layout
+        motion = replace(self.motion, control_hz=spec.action.control_hz)
+        self._follower = WaypointFollower(spec, num_envs, motion, device)
+
+    @abstractmethod
+    def plan(self, scene: Mapping[str, Tensor], seeds: Sequence[int]) -> Sequence[Waypoint]:
+        """Return the way-points of the N rows' episodes.
+
+        Args:
+            scene: parts of the first privileged state by their names in the spec's layout, (N, width) float64 each.
+            seeds: N seeds.
+        """
+
+    def reset(self, state: Tensor, seeds: Sequence[int], mask: Tensor) -> None:
+        """Plan the episodes of the rows in `mask` (N,) from their first state (N, S) and seeds (N)."""
+        scene = {name: state[:, start:stop].double() for name, (start, stop) in self._layout.items()}
+        self._follower.reset(waypoint_table(self.plan(scene, seeds), state), mask)
+
+    def act(self, state: Tensor) -> Tensor:
+        """Return the next action (N, 7) in [-1, 1] for the state (N, S)."""
+        return self._follower.act(state)

@@ -46,6 +46,11 @@ TABLE_CENTRE = (0.25, 0.0, -0.02)  # m: the top is z = 0, the height of the robo
 TABLE_COLOR = (0.55, 0.47, 0.38, 1.0)
 SPAWN_CLEARANCE = 3e-4  # m above rest: nothing has to settle, nothing interpenetrates
 START_JOINT_NOISE = 0.02  # rad, uniform to either side
+STILL_SPEED, STILL_TURN = 0.01, 0.5  # m/s, rad/s: an object that moves no faster stands still
+
+FINGERS_ALONG_X = (-0.452075, -1.507987, 0.854125, -0.916934, -1.570796, -2.022871)
+FINGERS_ALONG_Y = (*FINGERS_ALONG_X[:5], -0.452075)
+"""Arm joints, rad, with the TCP at (0.30, 0, 0.25) m and the tool down: the fingers close along base x, or along y."""
 
 _SHARED_STATE = {"tcp_pose": 7, "tcp_target_pose": 7, "opening": 1, "arm_qpos": 6, "arm_qvel": 6}
 """Parts of the privileged state that every task has, with their widths: poses, m, rad, rad/s."""

@@ -87,9 +87,7 @@ def test_holding_the_white_cube_is_no_grasp_of_the_red_one():
 
 
 @pytest.mark.parametrize("cube", ["red", "white"])
-@pytest.mark.parametrize(
-    ("motion", "slow", "fast"), [("linear_velocity", 0.009, 0.011), ("angular_velocity", 0.4, 0.6)]
-)
+@pytest.mark.parametrize(("motion", "slow", "fast"), MOTIONS)
 def test_stacked_but_moving_is_not_yet(cube, motion, slow, fast):
     for speed, expected in ((slow, DONE), (fast, {"stacked"})):
         env = with_red((0.0, 0.0))

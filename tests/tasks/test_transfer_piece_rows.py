@@ -9,6 +9,7 @@ import torch
 from fake_rows import fresh, turned
 from manicm_ms.tasks.transfer_piece import TransferPieceEnv
 
+from manicm_ms.envs.cameras import D435I
 from manicm_ms.robots.limits import pose_in_frame, quat_rotate
 
 RIGHT = -0.0425  # m: y of the right compartment's centre in the box's frame
@@ -46,6 +47,13 @@ def test_right_is_the_robots_right():
     env = with_piece(0.0, RIGHT, box_yaw=0.0)
     assert env.piece.raw[0, 1] < env.box.raw[0, 1]
     assert flags(env) == DONE
+
+
+def test_in_the_cameras_picture_left_and_right_are_swapped():
+    """The camera looks at the robot: what lies in the robot's left compartment is on the right of the picture."""
+    to_base = D435I.pose.to_transformation_matrix()  # SAPIEN's camera axes: x forward, y to the picture's left, z up
+    left, right = (to_base[:3, 1] @ ([0.32, y, 0.02] - to_base[:3, 3]) for y in (-RIGHT, RIGHT))
+    assert left < right
 
 
 def test_piece_in_the_left_compartment_is_not():
@@ -90,9 +98,7 @@ def test_the_fingertips_must_be_out_of_the_box(above, counts):
     assert found == (DONE if counts else {"placed", "still"})
 
 
-@pytest.mark.parametrize(
-    ("motion", "slow", "fast"), [("linear_velocity", 0.009, 0.011), ("angular_velocity", 0.4, 0.6)]
-)
+@pytest.mark.parametrize(("motion", "slow", "fast"), MOTIONS)
 def test_moving_piece_is_not_yet(motion, slow, fast):
     for speed, expected in ((slow, DONE), (fast, {"placed", "withdrawn"})):
         env = with_piece(0.0, RIGHT)
@@ -152,6 +158,15 @@ def test_the_piece_starts_clear_of_the_walls():
     reach = math.hypot(0.015, 0.015)
     off = pose_in_frame(env.piece.raw, env.box.raw)[:, :2] - torch.tensor([0.0, -RIGHT])
     assert (off.abs() + reach < torch.tensor([0.065, 0.040])).all()
+
+
+def test_the_goal_lies_as_high_as_the_piece_is():
+    """A larger piece that is held where it would stand has been carried all the way."""
+    env = with_piece(0.0, RIGHT, z=0.003 + 0.023)
+    env.half_sizes["piece"][0, 2] = 0.023
+    env.hold("piece", 10.0)
+    facts = env.evaluate() | {"placed": torch.zeros(4, dtype=torch.bool)}  # which earns the whole term by itself
+    torch.testing.assert_close(env.reward_terms(facts)["carry"][0].item(), 1.0, atol=1e-5, rtol=0)
 
 
 def staged(x, y, z, tcp_above, held=False):
