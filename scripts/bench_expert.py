@@ -3,13 +3,16 @@
 python scripts/bench_expert.py --episodes 200 --write          # every UR3e task, every style of its expert
 python scripts/bench_expert.py --env ur3e/slide-block --styles two-sided
 
-Every episode is noted in --records as it ends; the same command goes on where it was stopped.
+Every episode is noted in --records as it ends; the same command goes on where it was stopped. After a change of a task
+or an expert, choose another --records: what is noted there is not played again.
 """
 
 from __future__ import annotations
 
 import argparse
 import json
+import sys
+from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
@@ -19,10 +22,11 @@ import torch
 from numpy.typing import NDArray
 from rich.progress import track
 
-from manicm_ms.demos.experts import EXPERTS, Expert
+from manicm_ms.demos.experts import EXPERTS, Expert, require_style
 from manicm_ms.envs.chunk import ActionChunk
 from manicm_ms.envs.maniskill import ManiSkillSimulator
 from manicm_ms.envs.simulator import ENVS, SimulatorConfig
+from manicm_ms.errors import ConfigError, ManicmError
 from manicm_ms.evaluation.statistics import wilson_interval
 from manicm_ms.robots.ur3e_ag95 import ARM_JOINTS, JOINT_EFFORT, JOINT_SPEED
 from manicm_ms.types import STATE
@@ -165,7 +169,9 @@ def run(env_id: str, style: str, seeds: range, records: Path) -> list[EpisodeMot
     missing = [seed for seed in seeds if seed not in known]
     if missing:
         simulator = entry.build(spec, config)
-        assert isinstance(simulator, ManiSkillSimulator)
+        if not isinstance(simulator, ManiSkillSimulator):
+            simulator.close()
+            raise ConfigError(f"{env_id} does not run on ManiSkill: its torques cannot be measured")
         rows, meter = ActionChunk(simulator), TorqueMeter(simulator)
         expert = EXPERTS.get(env_id)(spec, 1, torch.device("cpu"), style)
         records.parent.mkdir(parents=True, exist_ok=True)
@@ -249,19 +255,32 @@ def main() -> None:
     parser.add_argument("--records", type=Path, default=Path("runs/expert"), help="folder of the episodes' records")
     args = parser.parse_args()
     torch.set_num_threads(1)
-    results: Results = {}
-    for env_id in args.env or ENVS.names(TAG):
-        known = EXPERTS.get(env_id).styles  # type: ignore[attr-defined]
-        for style in args.styles or known:
-            name = env_id if len(known) == 1 else f"{env_id}, {style}"
-            results[name] = run(
-                env_id, style, range(args.episodes), args.records / f"{env_id.replace('/', '-')}-{style}.jsonl"
-            )
-    text = _page(args.episodes, results)
+    try:
+        text = _page(args.episodes, measure(args.env or ENVS.names(TAG), args.styles, args.episodes, args.records))
+    except ManicmError as error:
+        print(f"bench_expert.py: {error}", file=sys.stderr)
+        sys.exit(2)
     print(text)
     if args.write:
         OUT.parent.mkdir(parents=True, exist_ok=True)
         OUT.write_text(text, encoding="utf-8")
+
+
+def measure(env_ids: Sequence[str], styles: Sequence[str] | None, episodes: int, records: Path) -> Results:
+    """Play the experts of `env_ids` in `styles`, all of them for None, on seeds 0 ... episodes - 1.
+
+    Raises ConfigError for a number of episodes below 1, UnknownNameError for an environment without expert or a style
+    that one does not have.
+    """
+    if episodes < 1:
+        raise ConfigError(f"episodes must be at least 1, got {episodes}")
+    known: dict[str, tuple[str, ...]] = {name: EXPERTS.get(name).styles for name in env_ids}  # type: ignore[attr-defined]
+    asked = [(name, require_style(style, known[name])) for name in env_ids for style in styles or known[name]]
+    results: Results = {}
+    for env_id, style in asked:
+        name = env_id if len(known[env_id]) == 1 else f"{env_id}, {style}"
+        results[name] = run(env_id, style, range(episodes), records / f"{env_id.replace('/', '-')}-{style}.jsonl")
+    return results
 
 
 def _page(episodes: int, results: Results) -> str:

@@ -96,3 +96,23 @@ def test_episodes_on_disk_are_not_played_again(tmp_path):
     page = bench_expert._page(2, {"ur3e/slide-block": again})
     assert "2/2" in page
     assert "| elbow | 28.0 |" in page
+
+
+@pytest.mark.parametrize(
+    ("words", "said"),
+    [
+        (["--env", "ur3e/slide-blok"], "did you mean 'ur3e/slide-block'"),
+        (["--env", "ur3e/stack-cube", "--styles", "two-sided"], "two-sided"),
+        (["--episodes", "0"], "at least 1"),
+    ],
+)
+def test_bad_input_is_one_line_and_plays_nothing(words, said, tmp_path, monkeypatch, capsys):
+    records = tmp_path / "records"
+    monkeypatch.setattr("sys.argv", ["bench_expert.py", "--records", str(records), *words])
+    with pytest.raises(SystemExit) as end:
+        bench_expert.main()
+    assert end.value.code == 2
+    (line,) = capsys.readouterr().err.splitlines()
+    assert line.startswith("bench_expert.py: ")
+    assert said in line
+    assert not records.exists()
