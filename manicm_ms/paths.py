@@ -125,7 +125,7 @@ def sync(path: Path) -> None:
         os.close(handle)
 
 
-def is_disk_full(error: Exception) -> bool:
+def is_disk_full(error: BaseException) -> bool:
     """Return whether `error` says that a disk, a quota or the largest size of a file is used up.
 
     Libraries that write through other languages give the reason as text alone.

@@ -175,11 +175,11 @@ def fresh_folder(out: Path) -> Iterator[Path]:
     absent = [parent for parent in out.absolute().parents if not parent.exists()]
     try:
         with temporary_folder(out) as box:
-            folder = box / out.name
+            folder = box / out.absolute().name
             yield folder
             sync_tree(folder)
             _move(folder, out)
-    except Exception as error:
+    except BaseException as error:  # Ctrl-C too
         for parent in absent:  # innermost first
             with suppress(OSError):
                 parent.rmdir()
