@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import difflib
+import json
 import math
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass, fields
@@ -102,6 +103,10 @@ class CameraModel:
         """(3, 3) pinhole matrix of the crop, pixels, pixel centres at half-integers: as renderers count."""
         cx, cy = self.cx - self.crop.left + 0.5, self.cy - self.crop.top + 0.5
         return np.array([[self.fx, 0, cx], [0, self.fy, cy], [0, 0, 1]])
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return plain JSON values, to be recorded and compared."""
+        return json.loads(json.dumps(asdict(self)))
 
     def metres(self, raw: Tensor) -> Tensor:
         """Return the depth in metres, float32, of raw readings in units: one rounding for all who convert."""

@@ -7,11 +7,11 @@ their seeds, so neither the number of environments nor an interruption changes t
 
 from __future__ import annotations
 
-import json
+import reprlib
 import shlex
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import ExitStack, contextmanager
-from dataclasses import asdict, dataclass, field
+from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -20,8 +20,8 @@ import numpy as np
 import torch
 from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 
-from manicm_ms.camera_model import read_camera
-from manicm_ms.demos.experts import EXPERTS, Expert, ExpertFactory
+from manicm_ms.camera_model import CameraModel, read_camera
+from manicm_ms.demos.experts import EXPERTS, Expert
 from manicm_ms.demos.store import OPTIONAL_FIELDS, DemoStore, Episode, frame_shapes
 from manicm_ms.envs.simulator import ENVS
 from manicm_ms.envs.vec_env import VecEnv, make_vec
@@ -50,6 +50,8 @@ _IDENTITY = (
 )  # fmt: skip
 _UNRECORDED: Mapping[str, Any] = {"realism": "clean", "realism_ranges": None, "camera": None}
 """What stores mean that were made before they recorded it."""
+_BRIEF = reprlib.Repr()
+_BRIEF.maxstring = 100  # names stay whole, a camera's matrix does not
 
 
 @dataclass(frozen=True)
@@ -215,6 +217,61 @@ class Collected:
     added: int
 
 
+@dataclass(frozen=True)
+class _Plan:
+    """What a collection asks for, whether into a store or into memory; see `collect`.
+
+    Raises ConfigError where a number is out of range or an extra is not known, UnknownNameError for the id.
+    """
+
+    env_id: str
+    num_envs: int
+    seed: int
+    style: str | None
+    backend: str
+    colors: bool
+    extras: tuple[str, ...]
+    tail_steps: int
+    realism: Realism
+    camera: CameraModel | None
+
+    def __post_init__(self) -> None:
+        if self.num_envs < 1:
+            raise ConfigError(f"num_envs must be at least 1, got {self.num_envs}")
+        require_seed(self.seed)
+        if unknown := set(self.extras) - set(OPTIONAL_FIELDS):
+            raise ConfigError(f"extras {sorted(unknown)} are not known: choose from {', '.join(OPTIONAL_FIELDS)}")
+        EXPERTS.get(self.env_id)
+
+    def asked(self) -> dict[str, Any]:
+        """Return what is known of `_IDENTITY` before the environment and the expert are made."""
+        return {
+            "env_id": self.env_id,
+            "seed": self.seed,
+            "tail_steps": self.tail_steps,
+            "fields": ["point_cloud", "agent_pos", ACTION, *(f for f in OPTIONAL_FIELDS if f in self.extras)],
+            "point_channels": 6 if self.colors else 3,
+            "realism": realism_name(self.realism),
+            "realism_ranges": None if self.realism.is_clean else self.realism.to_dict(),
+            "camera": None if self.camera is None else self.camera.to_dict(),
+        }
+
+    @contextmanager
+    def collector(self) -> Iterator[Collector]:
+        """Make environment and expert; yield what plays, and close the environment after it."""
+        keys = dict.fromkeys([POINT_CLOUD, AGENT_POS, STATE, *(_OBS_OF_FIELD[f] for f in self.extras)])
+        env = make_vec(
+            self.env_id, num_envs=self.num_envs, backend=self.backend, obs=tuple(keys), colors=self.colors,
+            realism=self.realism, camera=self.camera,
+        )  # fmt: skip
+        try:
+            expert = EXPERTS.get(self.env_id)(env.env_spec, self.num_envs, env.device, self.style)
+            conditions = partial(ENVS.get(self.env_id).conditions, self.realism)
+            yield Collector(env, expert, tail_steps=self.tail_steps, extras=self.extras, conditions=conditions)
+        finally:
+            env.close()
+
+
 def collect(
     env_id: str,
     episodes: int,
@@ -252,39 +309,26 @@ def collect(
     Raises StoreError where `out` holds other data or has a writer already, NoSpaceError, CameraError,
     UnknownNameError for the id, the style or the preset, ManicmError where the expert fails far too often.
     """
-    out, extras, realism = Path(out), tuple(extras), resolve_realism(realism)
-    _require_sound(episodes, num_envs, seed, extras)
-    factory, model = EXPERTS.get(env_id), None if camera is None else read_camera(camera)
-    asked = {
-        "env_id": env_id,
-        "seed": seed,
-        "tail_steps": tail_steps,
-        "fields": ["point_cloud", "agent_pos", ACTION, *(f for f in OPTIONAL_FIELDS if f in extras)],
-        "point_channels": 6 if colors else 3,
-        "realism": realism_name(realism),
-        "realism_ranges": None if realism.is_clean else realism.to_dict(),
-        "camera": None if model is None else json.loads(json.dumps(asdict(model))),
-    }
+    model = None if camera is None else read_camera(camera)
+    plan = _Plan(
+        env_id, num_envs, seed, style, backend, colors, tuple(extras), tail_steps, resolve_realism(realism), model
+    )
+    _require_some(episodes)
+    out = Path(out)
     exists = out.exists() and not (out.is_dir() and not any(out.iterdir()))
-    if exists and (finished := _finished(out, episodes, asked, factory, style, backend)):
+    if exists and (finished := _finished(out, episodes, plan)):
         return finished
     with ExitStack() as stack:
         # The lock is taken before the environment is made, so that a second writer is refused at once.
         store = stack.enter_context(DemoStore.open(out, "a")) if exists else None
-        env = make_vec(
-            env_id, num_envs=num_envs, backend=backend, obs=_obs_keys(extras), colors=colors, realism=realism,
-            camera=model,
-        )  # fmt: skip
-        stack.callback(env.close)
-        expert = factory(env.env_spec, num_envs, env.device, style)
-        asked |= {"expert": expert.name, "style": expert.style, "backend": env.backend}
-        command = _command(asked, episodes, extras, colors, camera)
-        conditions = partial(ENVS.get(env_id).conditions, realism)
-        collector = Collector(env, expert, tail_steps=tail_steps, extras=extras, conditions=conditions)
+        collector = stack.enter_context(plan.collector())
+        expert, env = collector.expert, collector.env
+        asked = plan.asked() | {"expert": expert.name, "style": expert.style, "backend": env.backend}
+        command = _command(asked, episodes, plan.extras, colors, camera)
         if store is None:
             collector.begin(seed)  # a simulator that does not run leaves no empty store behind
             provenance = asked | {"command": command, "versions": package_versions()}
-            store = stack.enter_context(_create(out, env.env_spec, provenance, episodes, conditions(seed)))
+            store = stack.enter_context(_create(out, env.env_spec, provenance, episodes, collector.conditions(seed)))
         _require_same_origin(store, asked, env.env_spec)
         with _progress_bar(env_id, episodes, len(store)) as report:
             added = fill(store, collector, episodes, seed, report)
@@ -310,20 +354,13 @@ def collect_episodes(
 
     Raises ConfigError, UnknownNameError, ManicmError as `collect`. An interruption loses them: for many, use `collect`.
     """
-    extras, realism = tuple(extras), resolve_realism(realism)
-    _require_sound(episodes, num_envs, seed, extras)
-    factory = EXPERTS.get(env_id)
+    model = None if camera is None else read_camera(camera)
+    plan = _Plan(
+        env_id, num_envs, seed, style, backend, colors, tuple(extras), tail_steps, resolve_realism(realism), model
+    )
+    _require_some(episodes)
     kept: list[Episode] = []
-    with ExitStack() as stack:
-        env = make_vec(
-            env_id, num_envs=num_envs, backend=backend, obs=_obs_keys(extras), colors=colors, realism=realism,
-            camera=camera,
-        )  # fmt: skip
-        stack.callback(env.close)
-        expert = factory(env.env_spec, num_envs, env.device, style)
-        conditions = partial(ENVS.get(env_id).conditions, realism)
-        collector = Collector(env, expert, tail_steps=tail_steps, extras=extras, conditions=conditions)
-        report = stack.enter_context(_progress_bar(env_id, episodes, 0))
+    with plan.collector() as collector, _progress_bar(env_id, episodes, 0) as report:
         for tried, attempt in enumerate(collector.attempts(seed, episodes), start=1):
             if attempt.episode is not None:
                 kept.append(attempt.episode)
@@ -375,18 +412,10 @@ def _require_hope(attempt: Attempt, kept: int, tried: int, wanted: int, fate: st
         )
 
 
-def _require_sound(episodes: int, num_envs: int, seed: int, extras: tuple[str, ...]) -> None:
-    """Raise ConfigError where a number is out of range or an extra is not known."""
-    if episodes < 1 or num_envs < 1:
-        raise ConfigError(f"episodes and num_envs must be at least 1, got {episodes} and {num_envs}")
-    require_seed(seed)
-    if unknown := set(extras) - set(OPTIONAL_FIELDS):
-        raise ConfigError(f"extras {sorted(unknown)} are not known: choose from {', '.join(OPTIONAL_FIELDS)}")
-
-
-def _obs_keys(extras: tuple[str, ...]) -> tuple[str, ...]:
-    """Return the observation keys that a `Collector` with these extras reads."""
-    return tuple(dict.fromkeys([POINT_CLOUD, AGENT_POS, STATE, *(_OBS_OF_FIELD[f] for f in extras)]))
+def _require_some(episodes: int) -> None:
+    """Raise ConfigError where no episode is asked for."""
+    if episodes < 1:
+        raise ConfigError(f"episodes must be at least 1, got {episodes}")
 
 
 def attempts_so_far(store: DemoStore, first_seed: int) -> int:
@@ -399,19 +428,18 @@ def attempts_so_far(store: DemoStore, first_seed: int) -> int:
     return max(store.attempts, last)
 
 
-def _finished(
-    out: Path, episodes: int, asked: Mapping[str, Any], factory: ExpertFactory, style: str | None, backend: str
-) -> Collected | None:
+def _finished(out: Path, episodes: int, plan: _Plan) -> Collected | None:
     """Return what `out` holds where that is all that is asked for, without starting an environment.
 
     Raises StoreError where it is no store, or holds other data than is asked for.
     """
+    asked = plan.asked()
     with DemoStore.open(out) as store:
         if store.provenance.get("env_id") == asked["env_id"]:  # else the expert would not fit the specs
-            expert = factory(store.spec, 1, torch.device("cpu"), style)
-            asked = {**asked, "expert": expert.name, "style": expert.style}
-        if backend != "auto":
-            asked = {**asked, "backend": backend}
+            expert = EXPERTS.get(plan.env_id)(store.spec, 1, torch.device("cpu"), plan.style)
+            asked |= {"expert": expert.name, "style": expert.style}
+        if plan.backend != "auto":
+            asked |= {"backend": plan.backend}
         _require_same_origin(store, asked)
         if len(store) < episodes:
             return None
@@ -437,14 +465,23 @@ def _require_same_origin(store: DemoStore, asked: Mapping[str, Any], spec: EnvSp
     has = {**_UNRECORDED, **store.provenance}
     for key in _IDENTITY:
         if key in asked and has.get(key) != asked[key]:
+            key, theirs, ours = _first_difference(key, has.get(key), asked[key])
             raise StoreError(
-                f"{store.path} holds demonstrations with {key} {has.get(key)!r} where {asked[key]!r} is asked for: "
-                "choose another --out, or the same options as before to go on"
+                f"{store.path} holds demonstrations with {key} {_BRIEF.repr(theirs)} where {_BRIEF.repr(ours)} is "
+                "asked for: choose another --out, or the same options as before to go on"
             )
     if spec is not None and store.spec != spec:
         raise StoreError(
             f"{store.path} was collected with other specs of {spec.env_id} than it has now: choose another --out"
         )
+
+
+def _first_difference(name: str, theirs: Any, ours: Any) -> tuple[str, Any, Any]:
+    """Return name and both values of the first entry that differs, within mappings as that of a camera."""
+    if not (isinstance(theirs, Mapping) and isinstance(ours, Mapping)):
+        return name, theirs, ours
+    key = next(key for key in sorted({*theirs, *ours}) if theirs.get(key) != ours.get(key))
+    return _first_difference(f"{name}.{key}", theirs.get(key), ours.get(key))
 
 
 def _command(
