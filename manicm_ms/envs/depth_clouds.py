@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from functools import partial
 from typing import NamedTuple
 
 import numpy as np
@@ -13,8 +12,6 @@ from torch import Tensor
 
 from manicm_ms.camera_model import CLOUD_SIZE, CameraModel, depth_to_cloud
 from manicm_ms.envs.cameras import MICROMETRE
-from manicm_ms.envs.simulator import ENVS
-from manicm_ms.errors import CameraError
 from manicm_ms.point_cloud import Box
 from manicm_ms.stereo_depth import StereoDepth
 
@@ -129,6 +126,8 @@ class DepthClouds:
                 depth, self.camera, self._seeds, frames,
                 intensity=None if rgb is None else rgb.mean(dim=-1), scale=self._scale,
             )  # fmt: skip
+        else:
+            depth = depth * self._scale[:, None, None]
         painted = rgb if lit is None else lit.to(torch.float32) / 255
         cloud = depth_to_cloud(
             depth, self.camera, self.workspace, self._num_points, self._size,
@@ -142,19 +141,3 @@ def sapien_pose(camera: CameraModel) -> sapien.Pose:
     T = camera.pose
     T[:3, :3] = T[:3, :3] @ np.array([[0, -1, 0], [0, 0, -1], [1, 0, 0]])  # columns: forward, left, up in OpenCV axes
     return sapien.Pose(T)
-
-
-def workspace_of(env_id: str) -> Box:
-    """Return the crop box of an environment's clouds, robot-base frame, metres.
-
-    Raises:
-        CameraError: the environment has no camera in a cell.
-    """
-    from mani_skill.utils.registration import REGISTERED_ENVS
-
-    build = ENVS.get(env_id).build
-    gym_id = build.keywords.get("gym_id") if isinstance(build, partial) else None
-    workspace = getattr(REGISTERED_ENVS[gym_id].cls, "workspace", None) if gym_id in REGISTERED_ENVS else None
-    if workspace is None:
-        raise CameraError(f"{env_id} has no workspace box for a camera's cloud: name a task of the UR3e's cell")
-    return workspace

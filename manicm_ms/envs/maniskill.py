@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from functools import partial
 from typing import Any
 
 import gymnasium
@@ -15,6 +16,7 @@ from manicm_ms import sapien_gpu, vulkan
 vulkan.prepare()  # before SAPIEN is first imported
 
 import mani_skill.envs  # noqa: E402, F401  (registers ManiSkill's own ids)
+from mani_skill.utils.registration import REGISTERED_ENVS  # noqa: E402
 
 from manicm_ms.camera_model import CameraModel, default_camera  # noqa: E402
 from manicm_ms.envs.cameras import CLOUD_POSITION, COLOR, cloud_shader, set_cloud_formats  # noqa: E402
@@ -23,6 +25,7 @@ from manicm_ms.envs.simulator import ENVS, Simulator, SimulatorConfig, StepResul
 from manicm_ms.envs.ur3e_tabletop import UR3eTabletopEnv  # noqa: E402
 from manicm_ms.envs.views import CameraView, IdealView, View  # noqa: E402
 from manicm_ms.errors import ConfigError, RenderDeviceError  # noqa: E402
+from manicm_ms.point_cloud import Box  # noqa: E402
 from manicm_ms.realism import RealismRows  # noqa: E402
 from manicm_ms.robots.ur3e_ag95 import TCP_STEP, opening_to_action  # noqa: E402
 from manicm_ms.types import AGENT_POS, DEPTH, IMAGE, POINT_CLOUD, STATE, EnvSpec  # noqa: E402
@@ -190,3 +193,19 @@ def _make(
             "SAPIEN found no Vulkan device to render with: run 'make setup' to install one, then 'manicm-ms doctor'"
         ) from error
     return env.unwrapped  # type: ignore[return-value]
+
+
+def gym_id(env_id: str) -> str:
+    """Return the id that a task is registered under with ManiSkill, for example "UR3eSlideBlock-v1".
+
+    Raises UnknownNameError for the id, ConfigError where the task is not one of ManiSkill.
+    """
+    build = ENVS.get(env_id).build
+    if isinstance(build, partial) and build.func is ManiSkillSimulator:
+        return str(build.keywords["gym_id"])
+    raise ConfigError(f"{env_id} does not run on ManiSkill: name a task of the UR3e's cell")
+
+
+def workspace_of(env_id: str) -> Box:
+    """Return the crop box of a task's clouds, robot-base frame, metres; raises as `gym_id`."""
+    return REGISTERED_ENVS[gym_id(env_id)].cls.workspace

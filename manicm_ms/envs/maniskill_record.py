@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from functools import partial
 from pathlib import Path
 from types import TracebackType
 from typing import Any, NamedTuple
@@ -11,9 +10,8 @@ import gymnasium
 import numpy as np
 import torch
 
-from manicm_ms.envs.maniskill import ManiSkillSimulator  # first: it chooses the Vulkan driver
+from manicm_ms.envs.maniskill import gym_id  # first: it chooses the Vulkan driver
 from manicm_ms.envs.simulator import ENVS
-from manicm_ms.errors import ConfigError
 
 from mani_skill.utils.wrappers import RecordEpisode  # isort: skip
 
@@ -91,14 +89,3 @@ class ManiSkillRecorder:
         self, kind: type[BaseException] | None, value: BaseException | None, trace: TracebackType | None
     ) -> None:
         self.close()
-
-
-def gym_id(env_id: str) -> str:
-    """Return the id that a task is registered under with ManiSkill, for example "UR3eSlideBlock-v1".
-
-    Raises UnknownNameError for the id, ConfigError where the task is not one of ManiSkill.
-    """
-    build = ENVS.get(env_id).build
-    if isinstance(build, partial) and build.func is ManiSkillSimulator:
-        return str(build.keywords["gym_id"])
-    raise ConfigError(f"{env_id} does not run on ManiSkill: convert its demonstrations to another format")

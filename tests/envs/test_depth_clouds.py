@@ -9,9 +9,10 @@ import torch
 
 from manicm_ms.camera_model import default_camera
 from manicm_ms.envs.cameras import CLOUD_POSITION, COLOR, D435I
-from manicm_ms.envs.depth_clouds import DepthClouds, sapien_pose, workspace_of
+from manicm_ms.envs.depth_clouds import DepthClouds, sapien_pose
+from manicm_ms.envs.maniskill import workspace_of
 from manicm_ms.envs.simulator import ENVS, SimulatorConfig
-from manicm_ms.errors import CameraError, UnknownNameError
+from manicm_ms.errors import ConfigError, UnknownNameError
 from manicm_ms.point_cloud import Box
 from manicm_ms.stereo_depth import StereoDepth
 from manicm_ms.types import POINT_CLOUD
@@ -123,6 +124,14 @@ def test_starting_one_row_leaves_the_others(native):
     assert torch.equal(batch.observe(two, [0, 5], colors).depth, before.depth)
 
 
+def test_a_scale_error_stands_without_noise_too(native):
+    position, _, _ = native
+    camera = clouds(None)
+    exact = camera.observe(position, [0]).depth
+    camera.start(ROW, [0], scale=torch.tensor([1.01]))
+    torch.testing.assert_close(camera.observe(position, [0]).depth, 1.01 * exact)
+
+
 def test_coloured_clouds_carry_rgb(native):
     position, color, _ = native
     cloud = clouds(StereoDepth(), colors=True).observe(position, [0], color).cloud
@@ -141,7 +150,7 @@ def test_colour_pictures_are_asked_for_only_where_they_matter():
 
 def test_the_workspace_is_that_of_the_task():
     assert Box((0.15, -0.25, 0.003), (0.50, 0.25, 0.15)) == WORKSPACE
-    with pytest.raises(CameraError, match="no workspace"):
+    with pytest.raises(ConfigError, match="does not run on ManiSkill"):
         workspace_of(point_mass_env.SOUND)
     with pytest.raises(UnknownNameError):
         workspace_of("ur3e/slide-blokc")

@@ -24,7 +24,8 @@ def export(job: Export) -> Tally:
     Raises StoreError where the episodes' seeds are not known, ConfigError for a task that does not run on
     ManiSkill, ManicmError where no episode is solved again.
     """
-    from manicm_ms.envs.maniskill_record import ManiSkillRecorder, gym_id  # SAPIEN: seconds to import
+    from manicm_ms.envs.maniskill import gym_id  # SAPIEN: seconds to import
+    from manicm_ms.envs.maniskill_record import ManiSkillRecorder
 
     env_id, provenance = job.store.spec.env_id, job.store.provenance
     if (job.store.seeds < 0).any():
