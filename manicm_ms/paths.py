@@ -56,12 +56,12 @@ def sha256(path: Path) -> str:
     return digest.hexdigest()
 
 
-def write_text(path: Path, text: str) -> None:
-    """Write a text file so that at every moment either the old or the new one is there, whole."""
+def write_bytes(path: Path, content: bytes) -> None:
+    """Write a file so that at every moment either the old or the new one is there, whole; make its folder."""
     handle, fresh = _temporary(path, _new_file)
     try:
-        with os.fdopen(handle, "w", encoding="utf-8") as f:
-            f.write(text)
+        with os.fdopen(handle, "wb") as f:
+            f.write(content)
             f.flush()
             os.fsync(handle)
             os.chmod(fresh, 0o644)
@@ -69,6 +69,11 @@ def write_text(path: Path, text: str) -> None:
     except BaseException:
         fresh.unlink(missing_ok=True)
         raise
+
+
+def write_text(path: Path, text: str) -> None:
+    """Write a text file in UTF-8, atomically."""
+    write_bytes(path, text.encode("utf-8"))
 
 
 def write_json(path: Path, value: Any) -> None:

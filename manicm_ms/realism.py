@@ -91,6 +91,8 @@ class Realism:
         for name in ("depth_scale", "focal", "friction", "mass", "size", "gains", "color"):
             if ranges[name] >= 1:
                 raise ConfigError(f"realism range {name} is relative: it must be below 1, got {ranges[name]}")
+        if self.lighting not in (0, 1):
+            raise ConfigError(f"realism range lighting is 0 or 1, got {self.lighting}")
         for name in ("action_delay", "gripper_delay"):
             if ranges[name] != int(ranges[name]) or ranges[name] > _MOST_DELAY:
                 raise ConfigError(f"realism range {name} is 0 to {_MOST_DELAY} control steps, got {ranges[name]}")

@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from io import BytesIO
 from pathlib import Path
 
 import cv2
 import numpy as np
 
 from manicm_ms.errors import CalibrationError, ConfigError, OutputExistsError, UnknownNameError
+from manicm_ms.paths import write_bytes
 
 DICTIONARIES = tuple(
     sorted(name.removeprefix("DICT_") for name in dir(cv2.aruco) if name.startswith("DICT_") and "h" not in name)
@@ -158,8 +160,9 @@ def print_board(spec: CharucoSpec, out: Path, *, overwrite: bool = False) -> str
     axes.imshow(spec.picture(), cmap="gray", vmin=0, vmax=255, interpolation="none", aspect="auto")
     axes.set_axis_off()
     figure.text(0.5, 0.25 - height / 4, f"{spec}; print at 100 % on {paper}", ha="center", va="center", fontsize=7)
-    out.parent.mkdir(parents=True, exist_ok=True)
-    figure.savefig(out, dpi=_DPI)
+    file = BytesIO()
+    figure.savefig(file, dpi=_DPI, format=out.suffix[1:])
+    write_bytes(out, file.getvalue())
     return paper
 
 

@@ -212,6 +212,7 @@ def cloud_command(
     env: str = "ur3e/slide-block",
     realism: str = "d435i",
     num_points: int = 512,
+    overwrite: bool = False,
 ) -> None:
     """Turn a recorded depth image into the cloud that a policy sees, exactly as the simulator makes its own.
 
@@ -222,10 +223,11 @@ def cloud_command(
         env: environment whose workspace box crops the cloud.
         realism: preset whose crop floor applies; a real camera's errors lift the table above that of clean.
         num_points: points wanted.
+        overwrite: replace the file where there is one.
     """
     from manicm_ms.cli.cloud import cloud
 
-    cloud(depth, camera, out, env, realism, num_points)
+    cloud(depth, camera, out, env, realism, num_points, overwrite)
 
 
 def calibrate_command(

@@ -61,6 +61,8 @@ def test_the_cloud_is_that_of_the_shared_function_to_the_bit(recording, told):
     assert status == 0
     assert "512 points, 512 of them distinct" in said
     np.testing.assert_array_equal(np.load(out, allow_pickle=False), expected(recording))
+    status, _, said = told(recording / "depth.png", "--camera", recording / "camera.yaml", "--out", out)
+    assert (status, "--overwrite" in said) == (USER_ERROR, True)
 
 
 def test_realism_chooses_the_crop_floor(recording, told):
