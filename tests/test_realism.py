@@ -122,6 +122,7 @@ def test_a_realism_is_recorded_as_plain_json():
         ({"friction": -0.1}, "friction must not be negative"),
         ({"mass": 1.0}, "mass is relative: it must be below 1"),
         ({"size": float("nan")}, "size must not be negative"),
+        ({"lighting": 2}, "lighting is 0 or 1"),
         ({"action_delay": 1.5}, "action_delay is 0 to 20 control steps"),
         ({"gripper_delay": 21}, "gripper_delay is 0 to 20 control steps"),
     ],
