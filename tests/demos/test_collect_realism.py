@@ -14,7 +14,7 @@ ENV_ID, PRESET = "ur3e/slide-block", "d435i+dr"
 @pytest.fixture(scope="module")
 def store(tmp_path_factory):
     path = tmp_path_factory.mktemp("collect") / "dr.zarr"
-    collect(ENV_ID, 2, path, seed=40, realism=PRESET, backend="cpu", num_envs=2)
+    collect(ENV_ID, 2, path, seed=40, realism=PRESET, backend="cpu")
     return path
 
 
