@@ -7,6 +7,7 @@ import pytest
 import zarr
 from store_samples import make_store
 
+from manicm_ms.cli import main
 from manicm_ms.demos.convert import import_store
 from manicm_ms.demos.store import DemoStore
 from manicm_ms.demos.survey import survey
@@ -72,6 +73,16 @@ def test_a_store_of_a_registered_env(theirs, tmp_path):
     assert survey(out).problems == []
 
 
+def test_the_command_line_reads_it(theirs, tmp_path, capsys):
+    out = tmp_path / "ours.zarr"
+    words = ["convert", str(theirs), "--from", "dp3", "--env", ENV_ID, "--num-points", "64", "--out", str(out)]
+    with pytest.raises(SystemExit, match=r"^0$"):
+        main(words)
+    assert f"{len(LENGTHS)} episodes, {sum(LENGTHS)} frames" in " ".join(capsys.readouterr().out.split())
+    with DemoStore.open(out) as store:
+        assert store.point_cloud.shape == (sum(LENGTHS), 64, 3)
+
+
 def assert_farthest_first(points):
     """Each point is farther from those before it than any later one is: the definition, checked by brute force."""
     gaps = np.linalg.norm(points[:, None] - points[None], axis=2)
@@ -129,8 +140,8 @@ FRAMES = sum(LENGTHS)
 @pytest.mark.parametrize(
     ("changes", "options", "error", "match"),
     [
-        ({"data/state": np.zeros((FRAMES, 24), "f4")}, {}, SpecMismatchError, "agent_pos has 24 entries .* has 10"),
-        ({"data/action": np.zeros((FRAMES, 4), "f4")}, {}, SpecMismatchError, "action has 4 entries .* has 7"),
+        ({"data/state": np.ones((FRAMES, 24), "f4")}, {}, SpecMismatchError, "agent_pos has 24 entries .* has 10"),
+        ({"data/action": np.ones((FRAMES, 4), "f4")}, {}, SpecMismatchError, "action has 4 entries .* has 7"),
         ({"data/action": np.full((FRAMES, 7), 1.5, "f4")}, {}, SpecMismatchError, r"reaches 1.5 .* \[-1, 1\]"),
         ({"data/action": np.full((FRAMES, 7), np.nan, "f4")}, {}, StoreError, "NaN"),
         ({"data/action": np.zeros((FRAMES - 1, 7), "f4")}, {}, StoreError, "damaged: action has 70 frames"),
@@ -172,6 +183,14 @@ def test_what_is_no_store_or_damaged_is_refused(theirs, tmp_path):
     with pytest.raises(OutputExistsError, match="choose another --out"):
         import_store(theirs, "dp3", out, env=ENV_ID)
     assert out.read_text() == "mine"
+
+
+@pytest.mark.parametrize("name", ["point_cloud", "state", "action"])
+def test_a_lost_file_is_not_read_as_zeros(theirs, tmp_path, name):
+    next((theirs / "data" / name).glob("0.*")).unlink()
+    with pytest.raises(StoreError, match=r"damaged: 1 of 1 files of .* are missing"):
+        import_store(theirs, "dp3", tmp_path / "new" / "ours.zarr", env=ENV_ID)
+    assert not (tmp_path / "new").exists()
 
 
 def test_a_store_of_ours_is_compared_by_its_own_spec(tmp_path):

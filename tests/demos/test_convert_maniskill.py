@@ -95,6 +95,11 @@ def test_what_is_not_solved_again_is_left_out_or_refused(tmp_path, episodes):
     idle = replace(episodes[0], action=np.zeros_like(episodes[0].action))
     done = convert(write_store(tmp_path / "some.zarr", [idle, episodes[1]]), "maniskill", tmp_path / "some")
     assert done.episodes == 1
+    about = json.loads((done.path / "trajectory.json").read_text())
+    assert [listed["episode_seed"] for listed in about["episodes"]] == [episodes[1].seed]
+    with h5py.File(done.path / "trajectory.h5") as file:
+        (kept,) = file.values()
+        np.testing.assert_array_equal(kept["actions"], episodes[1].action)
     assert f"left out: seeds [{idle.seed}]" in done.notes[1]
     with pytest.raises(ManicmError, match=r"none of the 1 episodes .* is solved again"):
         convert(write_store(tmp_path / "none.zarr", [idle]), "maniskill", tmp_path / "none")

@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 from store_samples import episode, make_store
 
+from manicm_ms.cli import main
 from manicm_ms.demos.convert import convert
 from manicm_ms.demos.store import DemoStore
 
@@ -53,9 +54,11 @@ def test_minari_reads_what_the_store_holds(store, tmp_path, monkeypatch, dataset
     assert [bool(m["success"]) for m in about] == [True, True, False]
 
 
-def test_minari_lists_it(store, tmp_path, monkeypatch):
+def test_minari_lists_what_the_command_line_wrote(store, tmp_path, monkeypatch, capsys):
     monkeypatch.setenv("MINARI_DATASETS_PATH", str(tmp_path))
-    convert(store, "minari", tmp_path / "reach-v0")
+    with pytest.raises(SystemExit, match=r"^0$"):
+        main(["convert", str(store), "--to", "minari", "--out", str(tmp_path / "reach-v0")])
+    assert "reach-v0: 3 episodes" in "".join(capsys.readouterr().out.split("\n"))
     assert list(minari.list_local_datasets()) == ["reach-v0"]
 
 

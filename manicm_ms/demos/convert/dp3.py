@@ -142,6 +142,10 @@ class _RawStore:
                 )
         if (channels := self.arrays["point_cloud"].shape[2]) not in (3, 6):
             raise StoreError(f"{self.path}: points have {channels} channels; 3 (xyz) or 6 (xyz, rgb) can be read")
+        for name, array in self.arrays.items():  # zarr reads what is missing as zeros, without a word
+            lost = array.nchunks - array.nchunks_initialized
+            if lost and array.shape[0] == self.num_frames:  # longer ones may have been allocated ahead
+                raise StoreError(f"{self.path} is damaged: {lost} of {array.nchunks} files of {name} are missing")
 
     def _add_pictures(self) -> None:
         """Take up pictures of a form that our stores have; others are left out with a note."""
