@@ -76,17 +76,16 @@ def test_the_agent_names_the_rows_at_every_reset(env, monkeypatch):
     assert [mask.tolist() for mask in named] == [[True]]
 
 
-@pytest.mark.parametrize("seed", [0, 1])
-def test_the_expert_succeeds_with_the_batched_ik_that_a_gpu_would_use(env, seed):
+def test_the_expert_succeeds_with_the_batched_ik_that_a_gpu_would_use(env):
     """One Levenberg-Marquardt step on pytorch_kinematics' Jacobian a control step; else Pinocchio iterates."""
     kinematics = env.unwrapped.agent.controller.controllers["arm"].kinematics
     kinematics._setup_gpu()
     assert kinematics.use_gpu_ik
     assert int(kinematics.qmask.sum()) == len(kinematics.qmask) == 6, "every joint of the chain is controlled"
-    env.reset(seed=seed)
+    env.reset(seed=0)
     base = env.unwrapped
     expert = EXPERTS.get(stack_cube.ENV_ID)(stack_cube.SPEC, 1, torch.device("cpu"), None)
-    expert.reset(base.privileged_state(), [seed], torch.ones(1, dtype=torch.bool))
+    expert.reset(base.privileged_state(), [0], torch.ones(1, dtype=torch.bool))
     worst = 0.0
     for _ in range(stack_cube.MAX_EPISODE_STEPS):
         _, _, terminated, _, info = env.step(expert.act(base.privileged_state()))

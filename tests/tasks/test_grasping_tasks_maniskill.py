@@ -1,4 +1,8 @@
-"""Stack Cube and Transfer Piece for real, on a CPU: the expert, doing nothing, forces, ManiSkill's own way in."""
+"""Stack Cube and Transfer Piece for real, on a CPU: the expert, forces, ManiSkill's own way in.
+
+What rewards and idle policies earn is tested in test_rewards.py, the vector interface in tests/envs/test_vec_env.py,
+for all tasks alike.
+"""
 
 import gymnasium as gym
 import numpy as np
@@ -10,7 +14,7 @@ import manicm_ms.envs.maniskill  # noqa: F401  (chooses the Vulkan driver before
 from manicm_ms.tasks import stack_cube, transfer_piece  # isort: skip
 
 from manicm_ms.demos.experts import EXPERTS
-from manicm_ms.envs.conformance import check_vec_env
+from manicm_ms.envs.simulator import ENVS
 from manicm_ms.robots.ur3e_ag95 import JOINT_SPEED
 
 HELD = {stack_cube: "red", transfer_piece: "piece"}
@@ -43,16 +47,20 @@ def expert_episode(task, env, seed, on_step):
     return last
 
 
-@pytest.mark.parametrize("seed", [300, 301, 302])
+@pytest.mark.parametrize("seed", [300, 301])
 def test_expert_succeeds_gently(task, env, seed):
     start, stop = task.SPEC.state_layout["arm_qvel"]
-    base, speeds, grips, rewards, seen = env.unwrapped, [], [], [], set()
+    base, speeds, grips, seen = env.unwrapped, [], [], set()
+    fixed = {name: [] for name in ENVS.get(task.ENV_ID).fixed}
 
-    def note(_, reward, terminated, truncated, info):
+    def note(*step):
+        info = step[-1]
+        assert not (info["grasped"] & info["success"]).any(), "success comes with letting go"
         speeds.append(base.privileged_state()[0, start:stop].abs())
         forces = base.agent.pad_forces(base.objects[HELD[task]])
         grips.append([force.norm(dim=1).item() for force in forces])
-        rewards.append(reward.item())
+        for name, poses in fixed.items():
+            poses.append(base.objects[name].pose.raw_pose.clone())
         seen.update(name for name, value in info.items() if value.dtype == torch.bool and value.item())
 
     _, _, terminated, truncated, info = expert_episode(task, env, seed, note)
@@ -60,41 +68,15 @@ def test_expert_succeeds_gently(task, env, seed):
     assert terminated.item()
     assert not truncated.item()
     assert "grasped" in seen
+    assert not info["grasped"].item()
     assert "fail" not in seen
     fastest = torch.stack(speeds).amax(dim=0)
     assert (fastest <= torch.tensor(JOINT_SPEED)).all(), fastest
     strongest, held = np.max(grips), np.min(grips, axis=1).max()
     assert held > 5.0, "both pads hold the object with more than its weight"
     assert strongest <= AG95_MOST
-    assert rewards[-1] == 1.0
-    assert max(rewards[:-1]) < 1.0
-    thirds = [np.mean(part) for part in np.array_split(rewards, 3)]
-    assert thirds == sorted(thirds)
-
-
-def test_a_carried_object_is_not_yet_a_success(task, env):
-    """While both fingers hold it, nothing counts as done: success comes with letting go."""
-
-    def note(_, reward, terminated, truncated, info):
-        assert not (info["grasped"] & info["success"]).any()
-
-    *_, info = expert_episode(task, env, 310, note)
-    assert info["success"].item()
-    assert not info["grasped"].item()
-
-
-@pytest.mark.parametrize("kind", ["no-op", "random"])
-def test_idle_and_random_policies_do_not_succeed(task, env, kind):
-    rng = np.random.default_rng(0)
-    for seed in range(1 if kind == "no-op" else 2):
-        env.reset(seed=seed)
-        for _ in range(task.MAX_EPISODE_STEPS):
-            action = np.zeros(7) if kind == "no-op" else rng.uniform(-1, 1, 7)
-            *_, info = env.step(torch.as_tensor(action, dtype=torch.float32)[None])
-            assert not info["success"].item()
-        if kind == "no-op":
-            assert not info["fail"].item()
-            assert info["still"].item()
+    for poses in fixed.values():
+        assert all(torch.equal(pose, poses[0]) for pose in poses)
 
 
 def test_objects_rest_where_they_are_placed(task, env):
@@ -102,7 +84,9 @@ def test_objects_rest_where_they_are_placed(task, env):
     base = env.unwrapped
     before = torch.cat([actor.pose.p for actor in base.objects.values()])
     for _ in range(20):
-        env.step(torch.zeros(1, 7))
+        *_, info = env.step(torch.zeros(1, 7))
+        assert info["still"].item()
+        assert not (info["success"] | info["fail"]).item()
     after = torch.cat([actor.pose.p for actor in base.objects.values()])
     assert (after - before).abs().max() < 1e-3
 
@@ -128,23 +112,7 @@ def test_made_by_its_id_alone(task):
     assert reward.shape == terminated.shape == truncated.shape == info["success"].shape == (1,)
 
 
-def test_conformance(task):
-    results = check_vec_env(task.ENV_ID, "cpu")
-    assert len(results) > 10
-    assert [result for result in results if not result.passed] == []
-
-
 # ---- Transfer Piece alone -------------------------------------------------------------------------------------------
-
-
-def test_the_box_stands_still_while_the_expert_works():
-    env = gym.make(transfer_piece.GYM_ID, num_envs=1, obs_mode="none", sim_backend="physx_cpu")
-    try:
-        poses = []
-        expert_episode(transfer_piece, env, 3, lambda *_: poses.append(env.unwrapped.box.pose.raw_pose.clone()))
-    finally:
-        env.close()
-    assert all(torch.equal(pose, poses[0]) for pose in poses)
 
 
 def test_half_closed_fingers_fit_between_the_walls_and_fully_open_ones_do_not():

@@ -12,7 +12,7 @@ from manicm_ms.envs.simulator import ENVS, SimulatorConfig
 from manicm_ms.types import STATE
 
 TASKS = [env_id for env_id in ENVS.names(tag="ur3e") if env_id in EXPERTS.names()]
-SEEDS = (500, 501, 502)
+SEEDS = (500, 501)
 ROW = torch.zeros(1, dtype=torch.int64)
 MARGIN = 0.2  # of the return, which lies in [0, 1]
 
