@@ -41,6 +41,7 @@ WHITE, GREY = (0.92, 0.92, 0.90, 1.0), (0.35, 0.36, 0.38, 1.0)
 
 FALLEN_HEIGHT = 0.045  # m: below it the block's centre is no longer on the cube
 MAX_CUBE_SHIFT, MAX_CUBE_TILT = 0.02, np.deg2rad(10)  # m, rad
+TOUCHING = 0.03  # m from the block's centre to the TCP of a hand that touches it: being nearer earns no more
 
 
 @register_env(GYM_ID, max_episode_steps=MAX_EPISODE_STEPS)
@@ -58,7 +59,7 @@ class SlideBlockEnv(UR3eTabletopEnv):
     start_qpos: ClassVar[tuple[float, ...]] = FINGERS_ALONG_X  # their flat sides face +y and -y
     start_opening: ClassVar[float] = 0.0
     table_friction: ClassVar[float] = TABLE_FRICTION
-    reward_weights: ClassVar[dict[str, float]] = {"reach": 1.0, "push": 2.0, "fall": 1.0, "cube_in_place": 1.0}
+    reward_weights: ClassVar[dict[str, float]] = {"reach": 2.0, "push": 2.0, "fall": 1.0, "cube_in_place": 1.0}
 
     def _load_objects(self) -> dict[str, Actor]:
         cube = self.build_box("cube", (CUBE_HALF,) * 3, WHITE, friction=CUBE_FRICTION, mass=CUBE_MASS)
@@ -109,8 +110,8 @@ class SlideBlockEnv(UR3eTabletopEnv):
     def reward_terms(self, info: dict[str, Tensor]) -> dict[str, Tensor]:
         """Return the named terms, each (N,) in [0, 1]; what a later stage leaves behind stays earned.
 
-        reach: the TCP comes near the block. push: the block leaves the cube's centre, full at the cube's edge.
-        fall: the block lies beside the cube. cube_in_place: the cube stays where it was.
+        reach: the TCP comes near the block, full where it touches. push: the block leaves the cube's centre, full at
+        the cube's edge. fall: the block lies beside the cube. cube_in_place: the cube stays where it was.
         """
         block, cube = self.block.pose.p, self.cube.pose.p
         distance = (self.agent.tcp_pose.p - block).norm(dim=1)
@@ -118,7 +119,7 @@ class SlideBlockEnv(UR3eTabletopEnv):
         shift, _ = pose_error(self.cube.pose, Pose.create(self.cube_start))
         fallen = info["block_fallen"].float()
         return {
-            "reach": torch.maximum(1 - torch.tanh(5 * distance), fallen),
+            "reach": torch.maximum(1 - torch.tanh(10 * (distance - TOUCHING).clamp(min=0)), fallen),
             "push": (slid / (self.half_sizes["cube"][:, 0] + self.half_sizes["block"][:, 0])).clamp(max=1),
             "fall": fallen,
             "cube_in_place": 1 - (shift / MAX_CUBE_SHIFT).clamp(max=1),

@@ -44,7 +44,7 @@ class StableBaselinesEnv(StableVecEnv):
         require_seed(seed)
         self.env = env
         self._next_seed = seed
-        self._keys = tuple(env.single_observation_space)  # type: ignore[arg-type]  # a Dict space
+        self._keys: tuple[str, ...] = tuple(env.single_observation_space)  # type: ignore[arg-type]  # a Dict space
         self._held = env.chunk.n_action_steps if env.chunk else 1
         spaces_of_rows = observation_space(env.env_spec, self._keys, None)
         self._actions = np.zeros((env.num_envs, env.env_spec.action.dim), np.float32)
@@ -75,7 +75,7 @@ class StableBaselinesEnv(StableVecEnv):
         ended = _array(terminated | truncated)
         infos = [self._row_info(k, obs, truncated, info) if ended[k] else {} for k in range(self.num_envs)]
         after = self._start(ended) if ended.any() else self._arrays(obs)
-        return after, _array(reward), ended, infos  # type: ignore[return-value]  # N plain dictionaries
+        return after, _array(reward), ended, infos
 
     def close(self) -> None:
         """Close the environment."""
