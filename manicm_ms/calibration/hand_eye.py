@@ -335,6 +335,7 @@ class _Flat:
 
     @classmethod
     def of(cls, views: Sequence[View]) -> _Flat:
+        """Return the corners of all views in one row each, with their view's tool pose (metres, base frame)."""
         counts = [len(view.corners.points) for view in views]
         return cls(
             np.repeat([view.T_base_tool.rotation.as_matrix() for view in views], counts, axis=0),

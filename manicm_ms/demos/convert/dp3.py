@@ -98,6 +98,7 @@ class _RawStore:
 
     @classmethod
     def open(cls, path: Path) -> _RawStore:
+        """Open the store at `path` to read; raise StoreError where it is none or an array is missing or damaged."""
         if not path.is_dir():
             raise StoreError(f"no store at {path}: name a folder that DP3 or ManiCM wrote, by custom something.zarr")
         names = {"point_cloud": "data/point_cloud", "agent_pos": "data/state", "action": "data/action"}
