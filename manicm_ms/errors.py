@@ -50,6 +50,10 @@ class StoreError(ManicmError):
     """A demonstration store that is missing, broken, locked or of another origin."""
 
 
+class ExpertFileError(ManicmError):
+    """An expert's weights that are missing, altered, or in a form that is not read."""
+
+
 class CheckpointError(ManicmError):
     """A checkpoint folder that is missing, incomplete, altered or foreign."""
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import importlib
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from contextlib import redirect_stderr
 from dataclasses import dataclass
 from functools import partial
@@ -13,6 +13,9 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
+from manicm_ms.demos import inert_pickle
+from manicm_ms.demos.expert_files import EXPERT_FILES, Arrays, ExpertFile, load_arrays
+from manicm_ms.demos.experts import EXPERTS, RowPolicy, RowwiseExpertFactory
 from manicm_ms.envs.mujoco_task import (
     DP3,
     MANICM_MS,
@@ -26,7 +29,8 @@ from manicm_ms.envs.mujoco_task import (
     require_suite,
     sample_or_pad_with_zeros,
 )
-from manicm_ms.envs.simulator import ENVS, EnvEntry, Simulator, SimulatorConfig
+from manicm_ms.envs.simulator import ENVS, DemoRule, EnvEntry, Simulator, SimulatorConfig
+from manicm_ms.errors import ExpertFileError
 from manicm_ms.point_cloud import Box
 from manicm_ms.types import ActionSpec, EnvSpec
 
@@ -263,7 +267,99 @@ for _row in TASKS:
             obs_presets=(MANICM_MS, DP3),
             has_realism=False,
             preload=("manicm_ms.envs.mujoco", "gymnasium.envs.mujoco.mujoco_env"),
+            # Never cut: success must hold at the end, so a policy has to see how it is held.
+            demos=DemoRule(_row.demo_success_steps, tail_steps=_row.max_episode_steps),
         ),
         tags=_row.tags,
         former=_row.former_names,
     )
+
+
+# ---- experts --------------------------------------------------------------------------------------------------
+
+_DAPG = "https://raw.githubusercontent.com/aravindr93/hand_dapg/9a1de23df6574e1b94e1da742e3326eb1f61c013"
+_DAPG_CREDIT = (
+    "Policies of Rajeswaran et al., Learning Complex Dexterous Manipulation with Deep Reinforcement Learning and "
+    "Demonstrations, RSS 2018 (hand_dapg)."
+)
+_DAPG_LICENCE_SHA256 = "c71d239df91726fc519c6eb72d318ec65820627232b2f796219e87dcf35d0ab4"
+# task: (SHA-256 of the published pickle, digest of the arrays in it)
+_DAPG_SHA256 = {
+    "door": (
+        "288dd2131b905e40852d9eb032595bb9b3aa90b0502e9341e6b0e128b803478f",
+        "0aacb53fd0e27dce5b4ad14fad621873140a036c5ceb8b8852f6f0c037202f06",
+    ),
+    "hammer": (
+        "14c6b603af09acf87247f8b45d58f9671790d8e4ca0c48c8db5e1f7c98126ef4",
+        "dc2fab50bd23c6699357a71bb61ac4a9dec8bc0735e77ac7a296ae8348282514",
+    ),
+    "pen": (
+        "061dba4907a76b83139ae5a8d0809faa9774dd028d12ce869036b620bd728740",
+        "1b7b3f77fd3b8befe0c896dc4a69981f77dc40007bde6d757edfee481b532b7f",
+    ),
+}
+_SCALINGS = {"in_shift": 0.0, "in_scale": 1.0, "out_shift": 0.0, "out_scale": 1.0}  # and what they are if not set
+
+
+def read_dapg(content: bytes) -> Arrays:
+    """Return the mean network of a DAPG policy's pickle, of which nothing is executed.
+
+    Returns:
+        float32 `w0`, `b0`, `w1`, ... (out, in) and (out,), `in_shift`, `in_scale` (S,), `out_shift`, `out_scale` (Da,),
+        and `n_layers`.
+
+    Raises ExpertFileError where it is another kind of file.
+    """
+    model = inert_pickle.attributes(inert_pickle.describe(content)).get("model")
+    layers = list(_linear_layers(model))
+    if not layers:
+        raise ExpertFileError("the pickle holds no policy of DAPG: its attribute 'model' has no linear layers")
+    arrays: Arrays = {}
+    for k, (weight, bias) in enumerate(layers):
+        arrays |= {f"w{k}": weight.astype(np.float32), f"b{k}": bias.astype(np.float32)}
+    sizes = {"in": layers[0][0].shape[1], "out": layers[-1][0].shape[0]}
+    kept = inert_pickle.attributes(model)
+    for name, default in _SCALINGS.items():
+        found = inert_pickle.tensor(kept.get(name))
+        size = sizes[name.partition("_")[0]]
+        arrays[name] = np.full(size, default, np.float32) if found is None else found.reshape(-1).astype(np.float32)
+    return arrays | {"n_layers": np.array(len(layers))}
+
+
+def _linear_layers(module: Any) -> Iterator[tuple[NDArray[Any], NDArray[Any]]]:
+    """Yield weight and bias of the linear layers of a described torch module, in order."""
+    kept = inert_pickle.attributes(module)
+    parameters = inert_pickle.entries(kept.get("_parameters"))
+    weight, bias = (inert_pickle.tensor(parameters.get(name)) for name in ("weight", "bias"))
+    if weight is not None and bias is not None:
+        yield weight, bias
+    for child in inert_pickle.entries(kept.get("_modules")).values():
+        yield from _linear_layers(child)
+
+
+def _dapg_policy(env_id: str) -> RowPolicy:
+    """Return the deterministic mean of a DAPG policy: tanh between layers; its 1e-8 is the published code's."""
+    arrays = {name: array.astype(np.float64) for name, array in load_arrays(env_id).items()}
+    count = int(arrays["n_layers"])
+
+    def act(state: NDArray[np.float64]) -> NDArray[np.float64]:
+        hidden = (state - arrays["in_shift"]) / (arrays["in_scale"] + 1e-8)
+        for k in range(count):
+            hidden = arrays[f"w{k}"] @ hidden + arrays[f"b{k}"]
+            hidden = np.tanh(hidden) if k < count - 1 else hidden
+        return hidden * arrays["out_scale"] + arrays["out_shift"]
+
+    return act
+
+
+for _row in TASKS:
+    _name = _row.env_id.partition("/")[2]
+    _source, _arrays = _DAPG_SHA256[_name]
+    EXPERT_FILES.add(
+        _row.env_id,
+        ExpertFile(
+            _row.env_id, f"{_DAPG}/dapg/policies/{_name}-v0.pickle", _source, read_dapg, _arrays,
+            "Apache-2.0", f"{_DAPG}/LICENSE", _DAPG_LICENCE_SHA256, _DAPG_CREDIT,
+        ),
+    )  # fmt: skip
+    EXPERTS.add(_row.env_id, RowwiseExpertFactory(partial(_dapg_policy, _row.env_id), "DAPG policy", ("dapg",)))

@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+import warnings
 from functools import partial
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from manicm_ms import mujoco_gl
+from manicm_ms.demos.experts import EXPERTS, RowPolicy, RowwiseExpertFactory
 from manicm_ms.envs.mujoco_task import (
     DP3,
     MANICM_MS,
@@ -20,7 +23,7 @@ from manicm_ms.envs.mujoco_task import (
     require_suite,
     sample_or_pad_with_zeros,
 )
-from manicm_ms.envs.simulator import ENVS, EnvEntry, Simulator, SimulatorConfig
+from manicm_ms.envs.simulator import ENVS, DemoRule, EnvEntry, Simulator, SimulatorConfig
 from manicm_ms.point_cloud import Box
 from manicm_ms.types import ActionSpec, EnvSpec
 
@@ -252,7 +255,33 @@ for _row in TASKS:
             obs_presets=(MANICM_MS, DP3),
             has_realism=False,
             preload=("manicm_ms.envs.mujoco", "metaworld.env_dict"),
+            demos=DemoRule(_row.demo_success_steps),
         ),
         tags=_row.tags,
         former=_row.former_names,
+    )
+
+
+# ---- experts --------------------------------------------------------------------------------------------------
+
+
+def _scripted_policy(suite_id: str) -> RowPolicy:
+    """Return the suite's scripted policy of one of its environments."""
+    require_suite("metaworld")
+    mujoco_gl.prepare()  # before mujoco is first imported
+    from metaworld.policies import ENV_POLICY_MAP
+
+    policy = ENV_POLICY_MAP[suite_id]()
+
+    def act(state: NDArray[np.float64]) -> NDArray[np.float32]:
+        with warnings.catch_warnings():  # it warns of actions beyond the box, which are clipped here
+            warnings.simplefilter("ignore", UserWarning)
+            return policy.get_action(state)
+
+    return act
+
+
+for _row in TASKS:
+    EXPERTS.add(
+        _row.env_id, RowwiseExpertFactory(partial(_scripted_policy, _row.suite_id), "Meta-World script", ("scripted",))
     )

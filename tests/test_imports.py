@@ -28,7 +28,7 @@ ALLOWED = {
     "mujoco_gl": set(),
     "robots": {"vulkan"},
     "envs": {"robots", "tasks", "vulkan", "sapien_gpu", "mujoco_gl"},
-    "tasks": {"envs", "robots", "demos", "vulkan"},
+    "tasks": {"envs", "robots", "demos", "vulkan", "mujoco_gl"},
     "demos": {"envs", "tasks"},
     "policies": set(),
     "training": {"demos", "policies"},

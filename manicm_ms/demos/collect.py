@@ -11,7 +11,7 @@ import reprlib
 import shlex
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import ExitStack, contextmanager
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -23,7 +23,7 @@ from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn, Ti
 from manicm_ms.camera_model import CameraModel, read_camera
 from manicm_ms.demos.experts import EXPERTS, Expert
 from manicm_ms.demos.store import OPTIONAL_FIELDS, DemoStore, Episode, frame_shapes
-from manicm_ms.envs.simulator import ENVS
+from manicm_ms.envs.simulator import ENVS, DemoRule
 from manicm_ms.envs.vec_env import VecEnv, make_vec
 from manicm_ms.errors import ConfigError, ManicmError, StoreError
 from manicm_ms.paths import require_free_space
@@ -39,16 +39,15 @@ _OBS_OF_FIELD = {
     "depth": DEPTH,
     "privileged_state": STATE,
 }
-TAIL_STEPS = 8
-"""Control steps kept after the first success, so that a policy also sees the solved task and learns to rest."""
-
 # Beyond these failures an expert is broken, not unlucky.
 _FAILURES_PER_EPISODE, _FAILURES_FREE = 10, 50
 _IDENTITY = (
     "env_id", "seed", "expert", "style", "tail_steps", "fields", "point_channels", "backend", "realism",
-    "realism_ranges", "camera",
+    "realism_ranges", "camera", "success_steps", "obs_preset",
 )  # fmt: skip
-_UNRECORDED: Mapping[str, Any] = {"realism": "clean", "realism_ranges": None, "camera": None}
+_UNRECORDED: Mapping[str, Any] = {
+    "realism": "clean", "realism_ranges": None, "camera": None, "success_steps": 1, "obs_preset": "manicm_ms",
+}  # fmt: skip
 """What stores mean that were made before they recorded it."""
 _BRIEF = reprlib.Repr()
 _BRIEF.maxstring = 100  # names stay whole, a camera's matrix does not
@@ -76,6 +75,7 @@ class _Row:
     seed: int
     frames: dict[str, list[np.ndarray]] = field(default_factory=dict)
     solved_at: int | None = None  # steps played when success was first reported
+    success_steps: int = 0
 
 
 class Collector:
@@ -85,7 +85,7 @@ class Collector:
         env: vector environment whose observations hold `point_cloud`, `agent_pos`, `state` and
             what `extras` needs; finished rows stay as they are until they are reset.
         expert: plays all rows from `state`.
-        tail_steps: control steps kept after the first success where the task goes on after it.
+        rule: which episodes are kept, and where they are cut if the task goes on after its success.
         extras: optional fields of `Episode` to record, from `OPTIONAL_FIELDS`.
         conditions: returns what is drawn for the episode of a seed beside its scene, to be recorded with it.
     """
@@ -95,13 +95,13 @@ class Collector:
         env: VecEnv,
         expert: Expert,
         *,
-        tail_steps: int = TAIL_STEPS,
+        rule: DemoRule = DemoRule(),  # noqa: B008 (it is frozen)
         extras: Iterable[str] = (),
         conditions: Callable[[int], RealismSample] = lambda seed: {},
     ) -> None:
-        if tail_steps < 0:
-            raise ConfigError(f"tail_steps must not be negative, got {tail_steps}")
-        self.env, self.expert, self.tail_steps, self.conditions = env, expert, tail_steps, conditions
+        if rule.tail_steps < 0:
+            raise ConfigError(f"tail_steps must not be negative, got {rule.tail_steps}")
+        self.env, self.expert, self.rule, self.conditions = env, expert, rule, conditions
         self.spec = env.env_spec
         self.fields = ("point_cloud", "agent_pos", *extras)
         self._obs: Mapping[str, Any] = {}
@@ -164,6 +164,7 @@ class Collector:
         self._obs, _, terminated, truncated, info = self.env.step(actions)
         over, success = _numpy(terminated) | _numpy(truncated), _numpy(info["success"])
         errors = info.get("error", [None] * len(self._rows))
+        counted = info.get("success_steps")  # where an environment step is shorter than a control step
         ended = []
         for i, row in enumerate(self._rows):
             if row is None:
@@ -171,11 +172,17 @@ class Collector:
             steps = len(row.frames[ACTION])
             if success[i] and row.solved_at is None:
                 row.solved_at = steps
-            tail_played = row.solved_at is not None and steps - row.solved_at >= self.tail_steps
-            if over[i] or tail_played or errors[i] or steps >= self.spec.max_episode_steps:
+            row.success_steps = row.success_steps + bool(success[i]) if counted is None else int(counted[i])
+            if over[i] or self._tail_played(row, steps) or errors[i] or steps >= self.spec.max_episode_steps:
                 ended.append(self._finish(row, bool(success[i]), errors[i]))
                 self._rows[i] = None
         return ended
+
+    def _tail_played(self, row: _Row, steps: int) -> bool:
+        """Return whether a row has shown all that is kept; one that lacks successful steps may still get them."""
+        if row.solved_at is None or row.success_steps < self.rule.success_steps:
+            return False
+        return steps - row.solved_at >= self.rule.tail_steps
 
     def _record(self, actions: torch.Tensor) -> None:
         """Keep what each playing row sees and does."""
@@ -193,6 +200,9 @@ class Collector:
             return Attempt(row.seed, None, f"the episode crashed: {error}")
         if not solved:
             return Attempt(row.seed, None, f"not solved in {len(row.frames[ACTION])} steps")
+        if row.success_steps < self.rule.success_steps:
+            few = f"{row.success_steps} successful steps, of which {self.rule.success_steps} are wanted"
+            return Attempt(row.seed, None, few)
         arrays = {name: np.stack(values) for name, values in row.frames.items()}
         if bad := [name for name, a in arrays.items() if a.dtype.kind == "f" and not np.isfinite(a).all()]:
             return Attempt(row.seed, None, f"NaN or infinity in {', '.join(bad)}")
@@ -231,9 +241,10 @@ class _Plan:
     backend: str
     colors: bool
     extras: tuple[str, ...]
-    tail_steps: int
+    tail_steps: int | None
     realism: Realism
     camera: CameraModel | None
+    obs_preset: str
 
     def __post_init__(self) -> None:
         if self.num_envs < 1:
@@ -243,12 +254,20 @@ class _Plan:
             raise ConfigError(f"extras {sorted(unknown)} are not known: choose from {', '.join(OPTIONAL_FIELDS)}")
         EXPERTS.get(self.env_id)
 
+    @property
+    def rule(self) -> DemoRule:
+        """The task's own rule, with the tail that was asked for instead of its own."""
+        own = ENVS.get(self.env_id).demos
+        return own if self.tail_steps is None else replace(own, tail_steps=self.tail_steps)
+
     def asked(self) -> dict[str, Any]:
         """Return what is known of `_IDENTITY` before the environment and the expert are made."""
         return {
             "env_id": self.env_id,
             "seed": self.seed,
-            "tail_steps": self.tail_steps,
+            "tail_steps": self.rule.tail_steps,
+            "success_steps": self.rule.success_steps,
+            "obs_preset": self.obs_preset,
             "fields": ["point_cloud", "agent_pos", ACTION, *(f for f in OPTIONAL_FIELDS if f in self.extras)],
             "point_channels": 6 if self.colors else 3,
             "realism": realism_name(self.realism),
@@ -262,12 +281,12 @@ class _Plan:
         keys = dict.fromkeys([POINT_CLOUD, AGENT_POS, STATE, *(_OBS_OF_FIELD[f] for f in self.extras)])
         env = make_vec(
             self.env_id, num_envs=self.num_envs, backend=self.backend, obs=tuple(keys), colors=self.colors,
-            realism=self.realism, camera=self.camera,
+            realism=self.realism, camera=self.camera, obs_preset=self.obs_preset,
         )  # fmt: skip
         try:
             expert = EXPERTS.get(self.env_id)(env.env_spec, self.num_envs, env.device, self.style)
             conditions = partial(ENVS.get(self.env_id).conditions, self.realism)
-            yield Collector(env, expert, tail_steps=self.tail_steps, extras=self.extras, conditions=conditions)
+            yield Collector(env, expert, rule=self.rule, extras=self.extras, conditions=conditions)
         finally:
             env.close()
 
@@ -283,9 +302,10 @@ def collect(
     backend: str = "auto",
     colors: bool = False,
     extras: Iterable[str] = (),
-    tail_steps: int = TAIL_STEPS,
+    tail_steps: int | None = None,
     realism: str | Realism = "clean",
     camera: Path | None = None,
+    obs_preset: str = "manicm_ms",
 ) -> Collected:
     """Collect demonstrations of the registered expert of `env_id` into a store, with a progress bar.
 
@@ -302,17 +322,19 @@ def collect(
         backend: "cpu", "gpu" or "auto", as in `make_vec`.
         colors: store rgb beside xyz.
         extras: optional fields of `Episode` to store, from `OPTIONAL_FIELDS`.
-        tail_steps: control steps kept after the first success where the task goes on after it.
+        tail_steps: control steps kept after the first success where the task goes on after it; None: the task's own.
         realism: preset or ranges, as in `make_vec`; what it draws is stored with every episode.
         camera: YAML file of the cell's depth camera, as in `make_vec`.
+        obs_preset: as in `make_vec`.
 
     Raises StoreError where `out` holds other data or has a writer already, NoSpaceError, CameraError,
     UnknownNameError for the id, the style or the preset, ManicmError where the expert fails far too often.
     """
     model = None if camera is None else read_camera(camera)
     plan = _Plan(
-        env_id, num_envs, seed, style, backend, colors, tuple(extras), tail_steps, resolve_realism(realism), model
-    )
+        env_id, num_envs, seed, style, backend, colors, tuple(extras), tail_steps, resolve_realism(realism), model,
+        obs_preset,
+    )  # fmt: skip
     _require_some(episodes)
     out = Path(out)
     exists = out.exists() and not (out.is_dir() and not any(out.iterdir()))
@@ -346,9 +368,10 @@ def collect_episodes(
     backend: str = "auto",
     colors: bool = False,
     extras: Iterable[str] = (),
-    tail_steps: int = TAIL_STEPS,
+    tail_steps: int | None = None,
     realism: str | Realism = "clean",
     camera: Path | None = None,
+    obs_preset: str = "manicm_ms",
 ) -> list[Episode]:
     """Collect demonstrations into memory: the episodes that `collect` stores for the same arguments.
 
@@ -356,8 +379,9 @@ def collect_episodes(
     """
     model = None if camera is None else read_camera(camera)
     plan = _Plan(
-        env_id, num_envs, seed, style, backend, colors, tuple(extras), tail_steps, resolve_realism(realism), model
-    )
+        env_id, num_envs, seed, style, backend, colors, tuple(extras), tail_steps, resolve_realism(realism), model,
+        obs_preset,
+    )  # fmt: skip
     _require_some(episodes)
     kept: list[Episode] = []
     with plan.collector() as collector, _progress_bar(env_id, episodes, 0) as report:
@@ -490,8 +514,10 @@ def _command(
     """Return the command that makes the same data (the number of environments has no part in it)."""
     words = ["manicm-ms", "collect", asked["env_id"], "--episodes", episodes, "--seed", asked["seed"]]
     words += ["--style", asked["style"], "--backend", asked["backend"]]
-    words += ["--tail-steps", asked["tail_steps"]] if asked["tail_steps"] != TAIL_STEPS else []
+    tail = asked["tail_steps"]
+    words += ["--tail-steps", tail] if tail != ENVS.get(asked["env_id"]).demos.tail_steps else []
     words += ["--colors"] if colors else []
+    words += ["--obs-preset", asked["obs_preset"]] if asked["obs_preset"] != "manicm_ms" else []
     words += ["--realism", asked["realism"]] if asked["realism"] != "clean" else []
     words += ["--camera", camera] if camera is not None else []
     words += ["--extras", *extras] if extras else []

@@ -3,9 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 from typing import Protocol
 
+import numpy as np
 import torch
+from numpy.typing import NDArray
 
 from manicm_ms.errors import UnknownNameError
 from manicm_ms.registry import Registry
@@ -56,3 +59,50 @@ def require_style(style: str | None, styles: Sequence[str]) -> str:
     if chosen not in styles:
         raise UnknownNameError("expert style", chosen, styles)
     return chosen
+
+
+RowPolicy = Callable[[NDArray[np.float64]], NDArray[np.floating]]
+"""(S,) privileged state of one row -> its action (Da,), not yet clipped."""
+
+
+class RowwiseExpert:
+    """Plays every row by a function of its present state alone, as the published policies of other suites do.
+
+    Args:
+        policy: the function.
+        name: see `Expert`.
+        style: see `Expert`.
+    """
+
+    def __init__(self, policy: RowPolicy, name: str, style: str) -> None:
+        self._policy, self.name, self.style, self.styles = policy, name, style, (style,)
+
+    def reset(self, state: torch.Tensor, seeds: Sequence[int], mask: torch.Tensor) -> None:
+        """See `Expert.reset`: there is nothing to remember."""
+        del state, seeds, mask
+
+    def act(self, state: torch.Tensor) -> torch.Tensor:
+        """See `Expert.act`."""
+        rows = state.cpu().numpy().astype(np.float64)
+        actions = np.clip(np.stack([self._policy(row) for row in rows]), -1.0, 1.0)
+        return torch.from_numpy(actions.astype(np.float32)).to(state.device)
+
+
+@dataclass(frozen=True)
+class RowwiseExpertFactory:
+    """Builds `RowwiseExpert`s; an `ExpertFactory`.
+
+    Attributes:
+        load: returns the policy; raises ManicmError where what it is made of is not here.
+        name: see `Expert`.
+        styles: its one style.
+    """
+
+    load: Callable[[], RowPolicy]
+    name: str
+    styles: tuple[str]
+
+    def __call__(self, spec: EnvSpec, num_envs: int, device: torch.device, style: str | None) -> RowwiseExpert:
+        """See `ExpertFactory`."""
+        del spec, num_envs, device
+        return RowwiseExpert(self.load(), self.name, require_style(style, self.styles))

@@ -128,6 +128,20 @@ class Simulator(ABC):
 
 
 @dataclass(frozen=True)
+class DemoRule:
+    """Which episodes of an expert become demonstrations of a task, and where they are cut.
+
+    Attributes:
+        success_steps: environment steps with success that an episode must hold.
+        tail_steps: control steps kept after the first success, so that a policy also sees the solved task and learns
+            to rest. A task whose success must hold to the end wants all of them.
+    """
+
+    success_steps: int = 1
+    tail_steps: int = 8
+
+
+@dataclass(frozen=True)
 class EnvEntry:
     """A registered environment.
 
@@ -140,6 +154,7 @@ class EnvEntry:
         obs_presets: those of `OBS_PRESETS` that it has.
         has_realism: whether it knows realism presets and camera files.
         preload: modules that take long to import and that worker processes may share; a missing one is no error.
+        demos: which episodes of its expert become demonstrations.
     """
 
     spec: EnvSpec
@@ -150,6 +165,7 @@ class EnvEntry:
     obs_presets: tuple[str, ...] = ("manicm_ms",)
     has_realism: bool = True
     preload: tuple[str, ...] = ()
+    demos: DemoRule = DemoRule()  # noqa: RUF009 (it is frozen)
 
     def require(self, config: SimulatorConfig) -> None:
         """Raise ConfigError where `config` asks for what this environment does not have."""

@@ -20,7 +20,8 @@ class TeacherPreset(FitConfig):
         n_action_steps: Ta, actions executed.
         prediction_type: what the network predicts: "sample" (x0) or "epsilon" (noise).
         cloud_frame: "base" leaves the cloud where it is and scales it to [-1, 1]; "tcp" takes it relative to the
-            tool centre point, in units of `cloud_scale`: 20 of 50 episodes more on Meta-World's pick-place.
+            tool centre point, in units of `cloud_scale`: 20 of 50 episodes more on Meta-World's pick-place. "auto" is
+            tcp where agent_pos holds that point, else base (a hand without an arm's tool, as Adroit's).
         cloud_scale: metres that become 1 with `cloud_frame` "tcp"; unused with "base".
         points: points drawn at random from each cloud in each step, and the length of the prefix read when acting
             (clouds are stored in farthest-point order, so a prefix is a coarser cloud); None uses them all.
@@ -96,7 +97,7 @@ TEACHER_PRESETS.add(
         learning_rate=1e-3,
         warmup_steps=100,
         clip_norm=1.0,
-        cloud_frame="tcp",
+        cloud_frame="auto",
         points=128,
         down_dims=(64, 128, 256),
     ),

@@ -87,7 +87,7 @@ def train_teacher(
 def build_teacher(policy_name: str, demos: Demos, preset: TeacherPreset, seed: int) -> DiffusionPolicy:
     """Return the untrained teacher of a preset, its normaliser fitted to the demonstrations."""
     network: dict[str, Any] = {
-        "cloud_frame": preset.cloud_frame,
+        "cloud_frame": _cloud_frame(preset, demos),
         "cloud_scale": preset.cloud_scale,
         "max_points": preset.points,
     }
@@ -96,3 +96,9 @@ def build_teacher(policy_name: str, demos: Demos, preset: TeacherPreset, seed: i
     config = {"network": network, "diffusion": {"prediction_type": preset.prediction_type}}
     policy = make_policy(policy_name, demos.spec, preset.chunk, config, stats=demos.stats, seed=seed)
     return cast(DiffusionPolicy, policy)
+
+
+def _cloud_frame(preset: TeacherPreset, demos: Demos) -> str:
+    if preset.cloud_frame != "auto":
+        return preset.cloud_frame
+    return "base" if demos.spec.tcp_indices is None else "tcp"
