@@ -271,7 +271,8 @@ def _scripted_policy(suite_id: str) -> RowPolicy:
     mujoco_gl.prepare()  # before mujoco is first imported
     from metaworld.policies import ENV_POLICY_MAP
 
-    policy = ENV_POLICY_MAP[suite_id]()
+    make: Any = ENV_POLICY_MAP[suite_id]
+    policy = make()
 
     def act(state: NDArray[np.float64]) -> NDArray[np.float32]:
         with warnings.catch_warnings():  # it warns of actions beyond the box, which are clipped here

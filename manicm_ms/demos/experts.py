@@ -75,7 +75,8 @@ class RowwiseExpert:
     """
 
     def __init__(self, policy: RowPolicy, name: str, style: str) -> None:
-        self._policy, self.name, self.style, self.styles = policy, name, style, (style,)
+        self._policy, self.name, self.style = policy, name, style
+        self.styles: tuple[str, ...] = (style,)
 
     def reset(self, state: torch.Tensor, seeds: Sequence[int], mask: torch.Tensor) -> None:
         """See `Expert.reset`: there is nothing to remember."""
@@ -100,7 +101,7 @@ class RowwiseExpertFactory:
 
     load: Callable[[], RowPolicy]
     name: str
-    styles: tuple[str]
+    styles: tuple[str, ...]
 
     def __call__(self, spec: EnvSpec, num_envs: int, device: torch.device, style: str | None) -> RowwiseExpert:
         """See `ExpertFactory`."""

@@ -1,11 +1,11 @@
-"""Reads tensors out of a pickle without executing it: its opcodes build a description, and nothing is imported or called.
+"""Reads tensors out of a pickle without executing it: nothing that it names is imported or called.
 
-`pickle.load` runs whatever callables the file names. Here the standard library's `pickletools` only takes the file apart
-into opcodes. What the file would import stays a name (`Global`), what it would call stays a note of the call (`Call`);
-of the notes that PyTorch and NumPy leave for an array, `tensor` makes the array from its bytes.
+`pickle.load` runs whatever callables a file names. Here the standard library's `pickletools` only takes the file apart
+into opcodes, and these build a description. What the file would import stays a name (`Global`), what it would call
+stays a note of the call (`Call`); from the notes that PyTorch and NumPy leave for an array, `tensor` makes the array.
 
-References: the opcodes' meaning is documented in CPython's `pickletools`; the legacy format of `torch.save` in PyTorch's
-`torch/serialization.py` (`_legacy_load`).
+References: the opcodes' meaning is documented in CPython's `pickletools`; the legacy format of `torch.save` in
+PyTorch's `torch/serialization.py` (`_legacy_load`).
 """
 
 from __future__ import annotations
@@ -125,6 +125,9 @@ class _Machine:
         del self.stack[at:]
         return above
 
+    def drop(self, discarded: Any) -> None:
+        """Take what was popped, and do nothing with it."""
+
     def tuple_of(self, count: int) -> None:
         """Replace the last `count` items by a tuple of them."""
         items = tuple(self.stack[-count:])
@@ -222,8 +225,8 @@ _CONSTANTS: Mapping[str, Callable[[], Any]] = {
     "MARK": _Mark,
 }
 _ACTIONS: Mapping[str, Callable[[_Machine, Any], None]] = {
-    "POP": lambda m, v: m.stack.pop() and None,
-    "POP_MARK": lambda m, v: m.pop_to_mark() and None,
+    "POP": lambda m, v: m.drop(m.stack.pop()),
+    "POP_MARK": lambda m, v: m.drop(m.pop_to_mark()),
     "DUP": lambda m, v: m.stack.append(m.stack[-1]),
     "TUPLE": lambda m, v: m.stack.append(tuple(m.pop_to_mark())),
     "TUPLE1": lambda m, v: m.tuple_of(1),

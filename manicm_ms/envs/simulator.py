@@ -165,7 +165,7 @@ class EnvEntry:
     obs_presets: tuple[str, ...] = ("manicm_ms",)
     has_realism: bool = True
     preload: tuple[str, ...] = ()
-    demos: DemoRule = DemoRule()  # noqa: RUF009 (it is frozen)
+    demos: DemoRule = DemoRule()
 
     def require(self, config: SimulatorConfig) -> None:
         """Raise ConfigError where `config` asks for what this environment does not have."""
