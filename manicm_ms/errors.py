@@ -9,6 +9,9 @@ from __future__ import annotations
 import difflib
 from collections.abc import Iterable
 
+_MOST_LISTED = 20  # names that an error lists in full ...
+_MOST_SHOWN = 6  # ... and how many of the nearest where there are more
+
 
 class ManicmError(Exception):
     """Base of all errors caused by input or surroundings rather than by a defect of the package."""
@@ -19,11 +22,13 @@ class UnknownNameError(ManicmError):
 
     def __init__(self, kind: str, asked: str, known: Iterable[str], present_name: str | None = None) -> None:
         names = sorted(known)
-        near = difflib.get_close_matches(asked, names, n=1, cutoff=0.4)
+        near = difflib.get_close_matches(asked, names, n=_MOST_SHOWN, cutoff=0.4)
         hint = f"did you mean {near[0]!r}? " if near else ""
         if present_name is not None:
             hint = f"it is called {present_name!r} here; "
-        super().__init__(f"unknown {kind} {asked!r}: {hint}known: {', '.join(names) or 'none'}")
+        shown = names if len(names) <= _MOST_LISTED else (near or names)[:_MOST_SHOWN]
+        rest = f" and {len(names) - len(shown)} more" if len(shown) < len(names) else ""
+        super().__init__(f"unknown {kind} {asked!r}: {hint}known: {', '.join(shown) or 'none'}{rest}")
         self.kind, self.asked, self.known = kind, asked, names
 
 

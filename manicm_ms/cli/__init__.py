@@ -34,9 +34,6 @@ _REMEDIES = {
 }
 
 
-_FILE_WIDTH = 160  # columns of a table that is not read on a terminal
-
-
 def list_command(kind: tyro.conf.Positional[Literal["envs", "policies", "presets"]], tag: str | None = None) -> None:
     """List what is registered: environments, policies or training presets.
 
@@ -44,17 +41,12 @@ def list_command(kind: tyro.conf.Positional[Literal["envs", "policies", "presets
         kind: what to list.
         tag: only the environments that carry this tag.
     """
-    from rich.console import Console
-
     from manicm_ms.cli import listing
 
     if tag is not None and kind != "envs":
         raise ConfigError(f"--tag selects environments, {kind} have no tags: use 'list envs --tag {tag}' or drop --tag")
     tables = {"envs": lambda: listing.envs(tag), "policies": listing.policies, "presets": listing.presets}
-    console = Console()
-    if not console.is_terminal:
-        console.width = max(console.width, _FILE_WIDTH)
-    console.print(tables[kind]())
+    listing.console().print(tables[kind]())
 
 
 def check_command(env_ids: tyro.conf.Positional[tuple[str, ...]], backend: Backend = "auto") -> int:
@@ -77,8 +69,9 @@ def check_command(env_ids: tyro.conf.Positional[tuple[str, ...]], backend: Backe
 
 
 def collect_command(
-    env_id: tyro.conf.Positional[str],
-    out: Path,
+    env_id: tyro.conf.Positional[str | None] = None,
+    out: Path | None = None,
+    tag: str | None = None,
     episodes: int = 10,
     num_envs: int | None = None,
     seed: int = 0,
@@ -86,14 +79,17 @@ def collect_command(
     backend: Backend = "auto",
     colors: bool = False,
     extras: tuple[str, ...] = (),
+    tail_steps: int | None = None,
     realism: str = "clean",
     camera: Path | None = None,
+    obs_preset: str = "manicm_ms",
 ) -> None:
-    """Collect demonstrations of the task's expert into a store, in parallel; the same command goes on after a kill.
+    """Collect demonstrations of a task's expert into a store, in parallel; the same command goes on after a kill.
 
     Args:
-        env_id: environment id.
-        out: the store, a folder, by custom called something.zarr.
+        env_id: environment id; or name a tag.
+        out: the store, a folder, by default data/ENV_ID.zarr; with --tag the folder of the stores, by default data.
+        tag: collect in every environment that carries this tag, one after another.
         episodes: solved episodes wanted.
         num_envs: environments that play at once; by default one a core. The data does not depend on it.
         seed: first seed; seeds count up from it.
@@ -101,17 +97,42 @@ def collect_command(
         backend: where to simulate.
         colors: store rgb beside xyz.
         extras: optional fields to store: image, depth, privileged_state.
+        tail_steps: control steps kept after the first success; by default the task's own number.
         realism: clean, d435i or d435i+dr: camera errors and physical values drawn for each episode.
         camera: YAML file of the cell's depth camera, as 'manicm-ms calibrate' writes it.
+        obs_preset: manicm_ms, or dp3 for clouds as the public DP3 wrapper makes them.
     """
-    from manicm_ms.demos.collect import collect
+    from manicm_ms.cli.collecting import collect_one, collect_tagged
     from manicm_ms.envs.vec_env import default_num_envs
 
-    done = collect(
-        env_id, episodes, out, num_envs=num_envs or default_num_envs(), seed=seed, style=style, backend=backend,
-        colors=colors, extras=extras, realism=realism, camera=camera,
-    )  # fmt: skip
-    print(f"{done.path}: {done.episodes} episodes from {done.attempts} attempts, {done.added} of them new")
+    options = {
+        "num_envs": num_envs or default_num_envs(), "seed": seed, "style": style, "backend": backend,
+        "colors": colors, "extras": extras, "tail_steps": tail_steps, "realism": realism, "camera": camera,
+        "obs_preset": obs_preset,
+    }  # fmt: skip
+    if (env_id is None) == (tag is None):
+        raise ConfigError("name one environment id, or --tag and a tag ('manicm-ms list envs' shows both)")
+    if env_id is not None:
+        collect_one(env_id, out, episodes, options)
+    else:
+        collect_tagged(str(tag), out, episodes, options)
+
+
+def experts_command(
+    action: tyro.conf.Positional[Literal["fetch", "list"]],
+    names: tyro.conf.Positional[tuple[str, ...]] = (),
+    from_: Annotated[Path | None, tyro.conf.arg(name="from")] = None,
+) -> None:
+    """Get the weights of published experts from their public source, checked by SHA-256, or list those there are.
+
+    Args:
+        action: what to do.
+        names: of experts, as in adroit/door; all of them by default.
+        from_: a folder that holds door.npz and so on with their LICENSE, instead of the public source.
+    """
+    from manicm_ms.cli.collecting import experts
+
+    experts(action, names, from_)
 
 
 def inspect_command(
@@ -178,6 +199,7 @@ def evaluate_command(
     threads: int = 1,
     realism: str = "clean",
     camera: Path | None = None,
+    obs_preset: str = "manicm_ms",
 ) -> None:
     """Judge checkpoints on the same fresh seeds: success with intervals, paired difference, decision latency, report.
 
@@ -195,13 +217,14 @@ def evaluate_command(
         threads: torch threads while policies act and latency is measured.
         realism: presets separated by commas, as in clean,d435i,d435i+dr: every policy plays the same seeds under each.
         camera: YAML file of the cell's depth camera, as 'manicm-ms calibrate' writes it.
+        obs_preset: the one that the policies were trained with: manicm_ms or dp3.
     """
     from manicm_ms.evaluation.judge import evaluate
 
     evaluate(
         _at_least_one(checkpoints, "checkpoint folder"), env, episodes, seed, out, num_envs=num_envs, backend=backend,
         device=device, control=control, videos=videos, threads=threads, realism=realism,
-        camera=camera, command=this_command(),
+        camera=camera, obs_preset=obs_preset, command=this_command(),
     )  # fmt: skip
 
 
@@ -308,6 +331,7 @@ _PLAIN: dict[str, Command] = {
     "list": list_command,
     "check": check_command,
     "collect": collect_command,
+    "experts": experts_command,
     "inspect": inspect_command,
     "convert": convert_command,
     "evaluate": evaluate_command,

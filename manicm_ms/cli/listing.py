@@ -4,9 +4,20 @@ from __future__ import annotations
 
 from dataclasses import fields
 
+from rich.console import Console
 from rich.table import Table
 
 from manicm_ms.errors import UnknownNameError
+
+_FILE_WIDTH = 160  # columns of a table that is not read on a terminal
+
+
+def console() -> Console:
+    """Return standard output, wide enough for a table where it is a file."""
+    found = Console()
+    if not found.is_terminal:
+        found.width = max(found.width, _FILE_WIDTH)
+    return found
 
 
 def envs(tag: str | None = None) -> Table:

@@ -252,6 +252,7 @@ class _Plan:
         require_seed(self.seed)
         if unknown := set(self.extras) - set(OPTIONAL_FIELDS):
             raise ConfigError(f"extras {sorted(unknown)} are not known: choose from {', '.join(OPTIONAL_FIELDS)}")
+        ENVS.get(self.env_id)  # knows former names too
         EXPERTS.get(self.env_id)
 
     @property

@@ -97,6 +97,11 @@ class Episode:
         return len(self.action)
 
 
+def store_path(folder: Path, env_id: str) -> Path:
+    """Return where the demonstrations of an environment lie by custom: `folder`/suite/task.zarr."""
+    return folder / f"{env_id}.zarr"
+
+
 def frame_shapes(spec: EnvSpec) -> dict[str, tuple[tuple[int, ...], np.dtype]]:
     """Return, per field of `Episode`, the shape of one frame and its type."""
     f32, (h, w) = np.dtype("<f4"), spec.obs.image_size

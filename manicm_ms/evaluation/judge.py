@@ -35,6 +35,7 @@ if TYPE_CHECKING:
     from manicm_ms.policies.base import Policy
 
 TEACHER, CONTROL, STUDENT = "teacher", "control", "student"
+OBS_PRESET = "manicm_ms"
 CLEAN = "clean"
 """Realism preset of the ideal world."""
 SCHEMA_VERSION = 1
@@ -120,6 +121,7 @@ def evaluate(
     repetitions: int = 50,
     realism: str = CLEAN,
     camera: Path | None = None,
+    obs_preset: str = OBS_PRESET,
     command: str | None = None,
     console: Console | None = None,
 ) -> dict[str, Any]:
@@ -143,6 +145,7 @@ def evaluate(
         repetitions: timed decisions per policy.
         realism: one or more presets, separated by commas: all policies play the same seeds under each of them.
         camera: YAML file of the cell's depth camera, as in `make_vec`.
+        obs_preset: as in `make_vec`; the one of the demonstrations that the policies learnt from.
         command: the command line to print in the report; None writes the equivalent of this call.
         console: where progress and table are printed; None is standard output.
 
@@ -166,13 +169,15 @@ def evaluate(
     entry = ENVS.get(env_id)
     backend = resolve_backend(backend, entry)
     for preset in protocol.realism:
-        entry.require(SimulatorConfig(realism=REALISM.get(preset), camera=model))
+        entry.require(SimulatorConfig(realism=REALISM.get(preset), camera=model, obs_preset=obs_preset))
     contenders = load_contenders(checkpoints, device, control)
     for contender in contenders:
-        _require_made_for(entry.spec, contender)
+        _require_made_for(SimulatorConfig(obs_preset=obs_preset).specialise(entry.spec), contender)
     request = _request(protocol, contenders, backend, device, model)
-    command = command or _command(checkpoints, env_id, episodes, seed, out, realism, camera)
-    envs = _env_maker(env_id, backend, model)
+    if obs_preset != OBS_PRESET:
+        request["obs_preset"] = obs_preset
+    command = command or _command(checkpoints, env_id, episodes, seed, out, realism, camera, obs_preset)
+    envs = env_maker(env_id, backend, model, obs_preset)
     return judge(contenders, protocol, envs, out, request, command, console or Console())
 
 
@@ -201,7 +206,8 @@ def _requested_realism(presets: tuple[str, ...], camera: CameraModel | None) -> 
     return requested
 
 
-def _env_maker(env_id: str, backend: str, camera: CameraModel | None) -> EnvMaker:
+def env_maker(env_id: str, backend: str, camera: CameraModel | None = None, obs_preset: str = OBS_PRESET) -> EnvMaker:
+    """Return what makes the real environments of `env_id`; see `evaluate` for the arguments."""
     from manicm_ms.envs.simulator import ENVS
     from manicm_ms.envs.vec_env import make_vec
 
@@ -209,11 +215,13 @@ def _env_maker(env_id: str, backend: str, camera: CameraModel | None) -> EnvMake
         obs = policy.spec.obs
         return make_vec(
             env_id, n, backend, chunk=policy.chunk, num_points=obs.num_points, colors=obs.point_channels == 6,
-            realism=preset, camera=camera,
+            realism=preset, camera=camera, obs_preset=obs_preset,
         )  # fmt: skip
 
     def for_film(n: int, preset: str) -> VecEnv:
-        return make_vec(env_id, n, backend, obs=(AGENT_POS,), video=True, realism=preset, camera=camera)
+        return make_vec(
+            env_id, n, backend, obs=(AGENT_POS,), video=True, realism=preset, camera=camera, obs_preset=obs_preset
+        )
 
     def conditions(preset: str, seed: int) -> RealismSample:
         return ENVS.get(env_id).conditions(REALISM.get(preset), seed)
@@ -596,9 +604,17 @@ def slug(name: str) -> str:
 
 
 def _command(
-    checkpoints: Sequence[Path], env_id: str, episodes: int, seed: int, out: Path, realism: str, camera: Path | None
+    checkpoints: Sequence[Path],
+    env_id: str,
+    episodes: int,
+    seed: int,
+    out: Path,
+    realism: str,
+    camera: Path | None,
+    obs_preset: str,
 ) -> str:
     words = ["manicm-ms", "evaluate", *map(str, checkpoints), "--env", env_id]
+    words += ["--obs-preset", obs_preset] if obs_preset != OBS_PRESET else []
     words += ["--realism", realism] if realism != CLEAN else []
     words += ["--camera", str(camera)] if camera is not None else []
     return shlex.join([*words, "--episodes", str(episodes), "--seed", str(seed), "--out", str(out)])

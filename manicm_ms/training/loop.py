@@ -5,9 +5,9 @@ from __future__ import annotations
 import math
 import time
 from abc import ABC, abstractmethod
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
-from typing import Any, ClassVar, Protocol
+from typing import Any, ClassVar, NamedTuple, Protocol
 
 import torch
 from lightning_fabric import Fabric
@@ -69,6 +69,18 @@ class FitResult:
     loss: float
     seconds: float
     resumed_from: int
+
+
+class Snapshots(NamedTuple):
+    """Where a training stops for a moment to be looked at.
+
+    Attributes:
+        steps: numbers of optimizer steps after which `take` is called.
+        take: called with that number; on one process, the first.
+    """
+
+    steps: frozenset[int] = frozenset()
+    take: Callable[[int], None] = lambda step: None
 
 
 class _Training:
@@ -185,6 +197,7 @@ def fit(
     seed: int,
     console: Console | None = None,
     title: str = "training",
+    snapshots: Snapshots = Snapshots(),  # noqa: B008 (it cannot change)
 ) -> FitResult:
     """Train `objective` on `data`, or go on where the run's saved state stands, until all steps are done.
 
@@ -200,6 +213,7 @@ def fit(
         seed: decides order and noise.
         console: shows a progress bar; None shows nothing.
         title: of the progress bar.
+        snapshots: what is done at which steps beside training; it must not change the objective.
 
     Raises:
         CheckpointError: the saved state is damaged, or of another version of the package.
@@ -209,7 +223,7 @@ def fit(
     if fabric.device.type == "cpu":
         keep_freed_memory()
     with torch_threads(config.threads):
-        return _fit(objective, data, config, run, fabric, seed, console, title)
+        return _fit(objective, data, config, run, fabric, seed, console, title, snapshots)
 
 
 def _fit(
@@ -221,6 +235,7 @@ def _fit(
     seed: int,
     console: Console | None,
     title: str,
+    snapshots: Snapshots,
 ) -> FitResult:
     steps = config.total_steps(len(data))
     training = _Training(objective, config, steps, fabric)
@@ -230,9 +245,9 @@ def _fit(
     objective.train()
     if fabric.is_global_zero:
         with RunLog(run.log_path, training.step) as log, loss_bar(console, title, steps) as bar:
-            _run_steps(training, data, steps, run, seed, log, bar)
+            _run_steps(training, data, steps, run, seed, log, bar, snapshots)
     else:
-        _run_steps(training, data, steps, run, seed, None, None)
+        _run_steps(training, data, steps, run, seed, None, None, Snapshots())
     return FitResult(training.step, training.loss, training.seconds, resumed_from)
 
 
@@ -244,6 +259,7 @@ def _run_steps(
     seed: int,
     log: RunLog | None,
     bar: LossBar | None,
+    snapshots: Snapshots,
 ) -> None:
     fabric, config = training.fabric, training.config
     stream = IndexStream(len(data), config.batch_size, seed)
@@ -261,6 +277,9 @@ def _run_steps(
                 log.write(training.step, **numbers)
             if bar is not None:
                 bar.update(training.step, numbers.get("loss"))
+            if training.step in snapshots.steps:
+                training.check_finite()
+                snapshots.take(training.step)  # before the state: a run that goes on from here has this one behind it
             if last or stop.asked or training.step % config.save_every == 0:
                 training.save(run)
             if stop.asked and not last:

@@ -8,6 +8,7 @@
       state.safetensors          the latest training state, one file, replaced atomically; gone at the end
       log.jsonl                  a line every few steps
       tensorboard/               the same numbers
+      snapshots/00000150/        a checkpoint after so many steps, only where asked for
       lock                       held by the process that trains
 """
 
@@ -138,6 +139,22 @@ class RunFolder:
 def training_folder(out: Path) -> Path:
     """Return the folder of the training state that belongs to checkpoint folder `out`."""
     return out.with_name(out.name + ".train")
+
+
+def snapshot_folder(out: Path, step: int) -> Path:
+    """Return where the checkpoint after `step` steps is kept while `out` is trained."""
+    return _snapshots(out) / f"{step:08d}"
+
+
+def snapshot_folders(out: Path) -> dict[int, Path]:
+    """Return steps -> checkpoint folder of the snapshots that the training of `out` has left so far."""
+    folder = _snapshots(out)
+    found = sorted(p for p in folder.iterdir() if p.name.isdecimal()) if folder.is_dir() else []
+    return {int(p.name): p for p in found}
+
+
+def _snapshots(out: Path) -> Path:
+    return training_folder(out) / "snapshots"
 
 
 @contextmanager

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import json
+import math
 import shlex
 import sys
 from collections.abc import Callable, Mapping
@@ -22,10 +23,10 @@ from manicm_ms.devices import resolve_device
 from manicm_ms.errors import CheckpointError, OutputExistsError
 from manicm_ms.policies.checkpoint import read_manifest, save_checkpoint
 from manicm_ms.training.device import make_fabric, resolve_precision
-from manicm_ms.training.loop import Batches, FitResult, fit
+from manicm_ms.training.loop import Batches, FitResult, Snapshots, fit
 from manicm_ms.training.objectives import PolicyObjective
 from manicm_ms.training.optim import FitConfig
-from manicm_ms.training.run_folder import RunFolder, open_run, training_folder
+from manicm_ms.training.run_folder import RunFolder, open_run, snapshot_folder, training_folder
 from manicm_ms.types import ChunkSpec, EnvSpec
 
 _NOT_IDENTITY = ("log_every", "save_every", "precision")  # the precision that is used stands beside the preset
@@ -118,6 +119,7 @@ class Session:
         inputs: Mapping[str, Any],
         provenance: Mapping[str, Any],
         build: Callable[[], tuple[PolicyObjective, Batches]],
+        snapshots: int = 0,
     ) -> Path:
         """Train and write the checkpoint, or go on with what an earlier process left, or find it all done.
 
@@ -125,6 +127,7 @@ class Session:
             inputs: what decides the weights beside preset, precision and seed, JSON values.
             provenance: of the inputs, for the checkpoint.
             build: makes objective and data, the same at each call.
+            snapshots: checkpoints kept on the way, at even distances, the last one at the end; see `snapshot_folders`.
 
         Returns:
             The checkpoint folder.
@@ -159,6 +162,7 @@ class Session:
                     seed=self.seed,
                     console=self.console,
                     title=f"{self.kind} {self.out.name}",
+                    snapshots=self._snapshots(snapshots, len(data), objective, run, provenance),
                 )
             except KeyboardInterrupt:
                 self._say(f"training state saved in {run.folder}")
@@ -169,6 +173,18 @@ class Session:
             self.fabric.barrier()
         self._say(f"{self.out}: {result.steps} steps in {result.seconds:.0f} s, loss {result.loss:.4g}")
         return self.out
+
+    def _snapshots(
+        self, count: int, samples: int, objective: PolicyObjective, run: RunFolder, provenance: Mapping[str, Any]
+    ) -> Snapshots:
+        """Return what saves `count` checkpoints on the way."""
+        last = self.preset.total_steps(samples)
+
+        def take(step: int) -> None:
+            so_far = FitResult(step, math.nan, math.nan, 0)
+            save_checkpoint(objective.outcome, snapshot_folder(self.out, step), self._record(run, so_far, provenance))
+
+        return Snapshots(frozenset(round(last * k / count) for k in range(1, count + 1)), take)
 
     def _open(self, identity: Mapping[str, Any]) -> AbstractContextManager[RunFolder]:
         if not self.fabric.is_global_zero:
@@ -184,8 +200,7 @@ class Session:
             "kind": self.kind,
             "command": self.command,
             "steps": result.steps,
-            "final_loss": result.loss,
-            "seconds": round(result.seconds, 1),
+            **({} if math.isnan(result.loss) else {"final_loss": result.loss, "seconds": round(result.seconds, 1)}),
             "seed": self.seed,
             "device": str(self.fabric.device),
             "precision": self.precision,

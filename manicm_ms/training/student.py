@@ -32,6 +32,7 @@ def distill(
     num_devices: int = 1,
     console: Console | None = None,
     command: str | None = None,
+    snapshots: int = 0,
 ) -> Path:
     """Distil a teacher and write the student's checkpoint; the same call goes on after a kill.
 
@@ -48,6 +49,7 @@ def distill(
         num_devices: devices that share each batch.
         console: for progress; standard error by default.
         command: the command line, for the record; this process's by default.
+        snapshots: checkpoints to keep on the way, at even distances; see `snapshot_folders`.
 
     Returns:
         `out`.
@@ -87,7 +89,7 @@ def distill(
     weights = manifest["files"]["model.safetensors"]["sha256"]
     inputs = {"teacher": weights, "data": demos.provenance["sha256"]}
     made_from = {"path": str(teacher), "sha256": weights, "provenance": manifest["provenance"]}
-    return session.complete(inputs, {"data": demos.provenance, "teacher": made_from}, build)
+    return session.complete(inputs, {"data": demos.provenance, "teacher": made_from}, build, snapshots)
 
 
 def _solver_steps(teacher: DiffusionPolicy, skip: int) -> int:

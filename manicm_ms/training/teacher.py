@@ -31,6 +31,7 @@ def train_teacher(
     num_devices: int = 1,
     console: Console | None = None,
     command: str | None = None,
+    snapshots: int = 0,
 ) -> Path:
     """Train a teacher and write its checkpoint; the same call goes on after a kill, and returns at once when done.
 
@@ -45,6 +46,7 @@ def train_teacher(
         num_devices: devices that share each batch.
         console: for progress; standard error by default.
         command: the command line, for the record; this process's by default.
+        snapshots: checkpoints to keep on the way, at even distances; see `snapshot_folders`.
 
     Returns:
         `out`.
@@ -81,7 +83,7 @@ def train_teacher(
         "env_spec": demos.spec.to_dict(),
         "data": demos.provenance["sha256"],
     }
-    return session.complete(inputs, {"data": demos.provenance}, build)
+    return session.complete(inputs, {"data": demos.provenance}, build, snapshots)
 
 
 def build_teacher(policy_name: str, demos: Demos, preset: TeacherPreset, seed: int) -> DiffusionPolicy:

@@ -1,0 +1,85 @@
+"""What `manicm-ms collect` and `manicm-ms experts` do beside collecting and fetching: paths, many tasks, tables."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+from rich.table import Table
+
+from manicm_ms.cli.listing import console
+from manicm_ms.demos.collect import Collected, collect
+from manicm_ms.demos.expert_files import EXPERT_FILES, fetch
+from manicm_ms.demos.experts import EXPERTS
+from manicm_ms.demos.store import DemoStore, store_path
+from manicm_ms.envs.simulator import ENVS
+from manicm_ms.errors import ConfigError, ManicmError, UnknownNameError
+from manicm_ms.paths import is_disk_full
+
+DATA = Path("data")
+
+
+def collect_one(env_id: str, out: Path | None, episodes: int, options: Mapping[str, Any]) -> Collected:
+    """Collect in one environment and say what came of it; `out` None takes its place under data."""
+    done = collect(env_id, episodes, out or store_path(DATA, env_id), **options)
+    print(f"{done.path}: {done.episodes} episodes from {done.attempts} attempts, {done.added} of them new")
+    return done
+
+
+def collect_tagged(tag: str, out: Path | None, episodes: int, options: Mapping[str, Any]) -> None:
+    """Collect in every environment with a tag, one after another, into `out`/ENV_ID.zarr; print a table.
+
+    Raises:
+        UnknownNameError: no environment carries the tag.
+        ConfigError: an option that only one environment can have.
+        ManicmError: some of them could not be collected; the others were.
+    """
+    if options["style"] is not None:
+        raise ConfigError("--style belongs to one environment: collect that one by its id")
+    names = tagged(tag)
+    table = Table("env id", "attempts", "kept", "mean length", "seconds")
+    failed: dict[str, str] = {}
+    for number, env_id in enumerate(names, start=1):
+        print(f"{number} of {len(names)}: {env_id}", flush=True)
+        began = time.perf_counter()
+        try:
+            done = collect_one(env_id, store_path(out or DATA, env_id), episodes, options)
+        except (ManicmError, OSError) as error:  # the others may fare better
+            if is_disk_full(error):
+                raise
+            failed[env_id] = str(error)
+            print(f"{env_id}: {error}", flush=True)
+            continue
+        with DemoStore.open(done.path) as store:
+            length = f"{store.lengths.mean():.0f}"
+        seconds = f"{time.perf_counter() - began:.0f}"
+        table.add_row(env_id, str(done.attempts), str(done.episodes), length, seconds)
+    console().print(table)
+    if failed:
+        first = next(iter(failed))
+        raise ManicmError(f"{len(failed)} of {len(names)} were not collected: {', '.join(failed)}; {failed[first]}")
+
+
+def tagged(tag: str) -> tuple[str, ...]:
+    """Return the environments that carry `tag` and have an expert; raise UnknownNameError where there are none."""
+    names = tuple(name for name in ENVS.names(tag) if name in EXPERTS.names())
+    if not names:
+        raise UnknownNameError("tag", tag, {t for name in EXPERTS.names() for t in ENVS.tags(name)})
+    return names
+
+
+def experts(action: str, names: tuple[str, ...], source: Path | None) -> None:
+    """Fetch or list the expert files called `names`, all of them where there are none."""
+    chosen = names or EXPERT_FILES.names()
+    if action == "fetch":
+        fetch(chosen, source)
+        return
+    if source is not None:
+        raise ConfigError("--from goes with 'experts fetch': drop it")
+    table = Table("expert", "kept at", "licence", "source")
+    for name in chosen:
+        file = EXPERT_FILES.get(name)
+        table.add_row(name, str(file.path) if file.path.is_file() else "not fetched", file.licence, file.url)
+    console().print(table)
