@@ -266,6 +266,7 @@ for _row in TASKS:
             backends=("cpu",),
             obs_presets=(MANICM_MS, DP3),
             has_realism=False,
+            group=_row.group,
             preload=("manicm_ms.envs.mujoco", "gymnasium.envs.mujoco.mujoco_env"),
             # Never cut: success must hold at the end, so a policy has to see how it is held.
             demos=DemoRule(_row.demo_success_steps, tail_steps=_row.max_episode_steps),
@@ -316,6 +317,9 @@ def read_dapg(content: bytes) -> Arrays:
         raise ExpertFileError("the pickle holds no policy of DAPG: its attribute 'model' has no linear layers")
     arrays: Arrays = {}
     for k, (weight, bias) in enumerate(layers):
+        inputs = layers[k - 1][1].shape if k else weight.shape[-1:]
+        if weight.shape != bias.shape + inputs or weight.ndim != 2:
+            raise ExpertFileError(f"layer {k} of the pickled policy has weights {weight.shape} and a bias {bias.shape}")
         arrays |= {f"w{k}": weight.astype(np.float32), f"b{k}": bias.astype(np.float32)}
     sizes = {"in": layers[0][0].shape[1], "out": layers[-1][0].shape[0]}
     kept = inert_pickle.attributes(model)
@@ -323,18 +327,25 @@ def read_dapg(content: bytes) -> Arrays:
         found = inert_pickle.tensor(kept.get(name))
         size = sizes[name.partition("_")[0]]
         arrays[name] = np.full(size, default, np.float32) if found is None else found.reshape(-1).astype(np.float32)
+        if len(arrays[name]) != size:
+            raise ExpertFileError(f"{name} of the pickled policy has {len(arrays[name])} entries instead of {size}")
     return arrays | {"n_layers": np.array(len(layers))}
 
 
 def _linear_layers(module: Any) -> Iterator[tuple[NDArray[Any], NDArray[Any]]]:
     """Yield weight and bias of the linear layers of a described torch module, in order."""
-    kept = inert_pickle.attributes(module)
-    parameters = inert_pickle.entries(kept.get("_parameters"))
-    weight, bias = (inert_pickle.tensor(parameters.get(name)) for name in ("weight", "bias"))
-    if weight is not None and bias is not None:
-        yield weight, bias
-    for child in inert_pickle.entries(kept.get("_modules")).values():
-        yield from _linear_layers(child)
+    waiting, seen = [module], set()
+    while waiting:
+        module = waiting.pop()
+        if id(module) in seen:
+            continue
+        seen.add(id(module))
+        kept = inert_pickle.attributes(module)
+        parameters = inert_pickle.entries(kept.get("_parameters"))
+        weight, bias = (inert_pickle.tensor(parameters.get(name)) for name in ("weight", "bias"))
+        if weight is not None and bias is not None:
+            yield weight, bias
+        waiting += reversed(inert_pickle.entries(kept.get("_modules")).values())
 
 
 def _dapg_policy(env_id: str) -> RowPolicy:

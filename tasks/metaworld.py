@@ -254,6 +254,7 @@ for _row in TASKS:
             backends=("cpu",),
             obs_presets=(MANICM_MS, DP3),
             has_realism=False,
+            group=_row.group,
             preload=("manicm_ms.envs.mujoco", "metaworld.env_dict"),
             demos=DemoRule(_row.demo_success_steps),
         ),

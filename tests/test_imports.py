@@ -33,6 +33,7 @@ ALLOWED = {
     "policies": set(),
     "training": {"demos", "policies"},
     "evaluation": {"envs", "policies"},
+    "benchmark": {"envs", "demos", "policies", "training", "evaluation"},
     "deploy": {"policies"},
     "doctor": {"vulkan", "sapien_gpu", "mujoco_gl"},
 }

@@ -18,6 +18,7 @@ from typing import Any
 
 import numpy as np
 import torch
+from rich.console import Console
 from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 
 from manicm_ms.camera_model import CameraModel, read_camera
@@ -307,6 +308,7 @@ def collect(
     realism: str | Realism = "clean",
     camera: Path | None = None,
     obs_preset: str = "manicm_ms",
+    console: Console | None = None,
 ) -> Collected:
     """Collect demonstrations of the registered expert of `env_id` into a store, with a progress bar.
 
@@ -327,6 +329,7 @@ def collect(
         realism: preset or ranges, as in `make_vec`; what it draws is stored with every episode.
         camera: YAML file of the cell's depth camera, as in `make_vec`.
         obs_preset: as in `make_vec`.
+        console: where progress is shown; standard output by default.
 
     Raises StoreError where `out` holds other data or has a writer already, NoSpaceError, CameraError,
     UnknownNameError for the id, the style or the preset, ManicmError where the expert fails far too often.
@@ -353,7 +356,7 @@ def collect(
             provenance = asked | {"command": command, "versions": package_versions()}
             store = stack.enter_context(_create(out, env.env_spec, provenance, episodes, collector.conditions(seed)))
         _require_same_origin(store, asked, env.env_spec)
-        with _progress_bar(env_id, episodes, len(store)) as report:
+        with _progress_bar(env_id, episodes, len(store), console) as report:
             added = fill(store, collector, episodes, seed, report)
         store.note(command=command)
         return Collected(out, len(store), store.attempts, added)
@@ -526,10 +529,12 @@ def _command(
 
 
 @contextmanager
-def _progress_bar(env_id: str, episodes: int, kept: int) -> Iterator[Callable[[int, int], None]]:
+def _progress_bar(
+    env_id: str, episodes: int, kept: int, console: Console | None = None
+) -> Iterator[Callable[[int, int], None]]:
     """Show the episodes kept and how many were tried for them; yield what reports both numbers."""
     columns = (TextColumn("[bold]{task.description}"), BarColumn(), TextColumn("{task.fields[note]}"))
-    with Progress(*columns, TimeElapsedColumn(), TimeRemainingColumn()) as progress:
+    with Progress(*columns, TimeElapsedColumn(), TimeRemainingColumn(), console=console) as progress:
         bar = progress.add_task(f"collect {env_id}", total=episodes, completed=kept, note=f"{kept} of {episodes} kept")
 
         def report(kept: int, attempts: int) -> None:

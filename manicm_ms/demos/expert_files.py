@@ -7,14 +7,13 @@ from a source, a folder or the cache unless its numbers have the SHA-256 that th
 from __future__ import annotations
 
 import hashlib
+import http.client
 import os
-import urllib.error
 import urllib.request
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from io import BytesIO
 from pathlib import Path
-from zipfile import BadZipFile
 
 import numpy as np
 from numpy.typing import NDArray
@@ -139,7 +138,7 @@ def _checked(file: ExpertFile, path: Path) -> Arrays:
     try:
         with np.load(BytesIO(path.read_bytes()), allow_pickle=False) as archive:
             arrays = {name: archive[name] for name in archive.files}
-    except (ValueError, OSError, BadZipFile, EOFError, AttributeError) as error:
+    except Exception as error:  # zipfile, zlib and NumPy raise many kinds on damaged files
         # NumPy says "allow_pickle=False" of pickles, be they the file itself or arrays of objects in it.
         pickled = "it holds pickles, which are never read" if "pickle" in str(error) else "it is damaged"
         raise ExpertFileError(
@@ -165,7 +164,7 @@ def _download(file: ExpertFile, url: str, sha256: str) -> bytes:
     try:
         with urllib.request.urlopen(url, timeout=_TIMEOUT_S) as response:
             content = response.read(_MOST_BYTES)
-    except (urllib.error.URLError, OSError, ValueError) as error:
+    except (OSError, http.client.HTTPException, ValueError) as error:  # URLError is an OSError
         reason = getattr(error, "reason", None) or error
         raise ExpertFileError(
             f"{url} cannot be fetched ({reason}): try again later, or give a folder that holds "

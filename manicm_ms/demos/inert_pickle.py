@@ -10,8 +10,10 @@ PyTorch's `torch/serialization.py` (`_legacy_load`).
 
 from __future__ import annotations
 
+import math
 import pickletools
 from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
 from dataclasses import dataclass, field
 from io import BytesIO
 from typing import Any
@@ -24,7 +26,9 @@ from manicm_ms.errors import ExpertFileError
 _STORAGE_TYPES = {
     "FloatStorage": "<f4", "DoubleStorage": "<f8", "HalfStorage": "<f2", "LongStorage": "<i8", "IntStorage": "<i4",
 }  # fmt: skip
+_LEGACY_MAGIC = 0x1950A86A20F9469CFC6C
 _MOST_OPCODES = 1_000_000  # a policy of some thousand weights has far fewer
+_MOST_NUMBERS = 10_000_000
 
 
 @dataclass(frozen=True)
@@ -65,6 +69,17 @@ class _Mark:
     """Where a tuple, list or dictionary begins on the stack."""
 
 
+@contextmanager
+def _malformed_is_told() -> Iterator[None]:
+    """Turn the many kinds of errors that nonsense raises, here and in pickletools, into ExpertFileError."""
+    try:
+        yield
+    except ExpertFileError:
+        raise
+    except Exception as error:
+        raise ExpertFileError(f"this is no pickle that can be read ({type(error).__name__}: {error})") from error
+
+
 def describe(content: bytes) -> Any:
     """Return what the first pickle in `content` describes: plain values, `Global`, `Call` and `Persistent`.
 
@@ -87,17 +102,13 @@ class _Machine:
         self.memo: dict[int, Any] = {}
 
     def run(self, stream: BytesIO) -> Any:
-        try:
+        with _malformed_is_told():
             for number, (opcode, value, _) in enumerate(pickletools.genops(stream)):
                 if number > _MOST_OPCODES:
                     raise ExpertFileError(f"the pickle has more than {_MOST_OPCODES} opcodes: it is no policy's")
                 if opcode.name == "STOP":
                     return self.stack.pop()
                 self._apply(opcode.name, value)
-        except ExpertFileError:
-            raise
-        except Exception as error:  # pickletools and the stack raise many kinds on what is no pickle
-            raise ExpertFileError(f"this is no pickle that can be read ({type(error).__name__}: {error})") from error
         raise ExpertFileError("the pickle has no end: the file is cut short")
 
     def _apply(self, name: str, value: Any) -> None:
@@ -120,7 +131,7 @@ class _Machine:
 
     def pop_to_mark(self) -> list[Any]:
         """Return what stands above the last mark, and remove both."""
-        at = max(k for k, item in enumerate(self.stack) if isinstance(item, _Mark))
+        at = next(k for k in reversed(range(len(self.stack))) if isinstance(self.stack[k], _Mark))
         above = self.stack[at + 1 :]
         del self.stack[at:]
         return above
@@ -130,9 +141,7 @@ class _Machine:
 
     def tuple_of(self, count: int) -> None:
         """Replace the last `count` items by a tuple of them."""
-        items = tuple(self.stack[-count:])
-        del self.stack[-count:]
-        self.stack.append(items)
+        self.stack.append(tuple(reversed([self.stack.pop() for _ in range(count)])))
 
     def call(self, value: Any) -> None:
         """Replace a callable and its arguments by a note of the call."""
@@ -161,7 +170,7 @@ class _Machine:
         """Note a call of a class's __new__."""
         named = self.stack.pop() if keywords else {}
         args, cls = self.stack.pop(), self.stack.pop()
-        self.stack.append(Call(cls, tuple(args), items=dict(named)))
+        self.stack.append(Call(cls, _arguments(args), items=dict(named)))
 
     def global_from_stack(self) -> None:
         """Replace a module and a name by what they name."""
@@ -169,8 +178,14 @@ class _Machine:
         self.stack.append(Global(str(module), str(name)))
 
 
+def _arguments(args: Any) -> tuple[Any, ...]:
+    if not isinstance(args, tuple):
+        raise ExpertFileError("the pickle calls something with arguments that are no tuple")
+    return args
+
+
 def _called(function: Any, args: Any) -> Any:
-    arguments = tuple(args)
+    arguments = _arguments(args)
     # How Python 3 writes bytes in the older protocols: text in latin-1.
     if function == Global("_codecs", "encode") and len(arguments) == 2 and isinstance(arguments[0], str):
         return arguments[0].encode("latin-1")
@@ -178,7 +193,8 @@ def _called(function: Any, args: Any) -> Any:
 
 
 def _key(value: Any) -> Any:
-    return value if isinstance(value, (str, bytes, int, float, bool, tuple, type(None))) else id(value)
+    """Return what stands for `value` as a key: itself where it is plain, else something that nobody asks for."""
+    return value if isinstance(value, (str, bytes, int, float, type(None))) else object()
 
 
 def _global(machine: _Machine, value: str) -> None:
@@ -211,8 +227,8 @@ def _set_item(machine: _Machine, value: Any) -> None:
 _IGNORED = {"PROTO", "FRAME"}
 _PUSHES_ITS_ARGUMENT = {
     "INT", "BININT", "BININT1", "BININT2", "LONG", "LONG1", "LONG4", "STRING", "BINSTRING", "SHORT_BINSTRING",
-    "BINBYTES", "SHORT_BINBYTES", "BINBYTES8", "UNICODE", "SHORT_BINUNICODE", "BINUNICODE", "BINUNICODE8", "FLOAT",
-    "BINFLOAT",
+    "BINBYTES", "SHORT_BINBYTES", "BINBYTES8", "BYTEARRAY8", "UNICODE", "SHORT_BINUNICODE", "BINUNICODE", "BINUNICODE8",
+    "FLOAT", "BINFLOAT",
 }  # fmt: skip
 _CONSTANTS: Mapping[str, Callable[[], Any]] = {
     "NONE": lambda: None,
@@ -266,26 +282,46 @@ def entries(description: Any) -> dict[Any, Any]:
         return {}
     # OrderedDict: pairs among the arguments (Python 2), or items set after an empty call (Python 3).
     pairs = description.args[0] if description.args and isinstance(description.args[0], list) else []
-    return {**{pair[0]: pair[1] for pair in pairs}, **description.items}
+    with _malformed_is_told():
+        return {_key(key): value for key, value in pairs} | description.items
 
 
 def tensor(description: Any) -> NDArray[Any] | None:
-    """Return the array that a described tensor, parameter or NumPy array would be; None for anything else."""
-    if not isinstance(description, Call):
-        return None
-    name = description.function.name if isinstance(description.function, Global) else ""
+    """Return the array that a described tensor, parameter or NumPy array would be; None for anything else.
+
+    Raises ExpertFileError where an array is described that cannot be, or in a way that this reader does not know.
+    """
+    waiting, seen = [description], set()
+    while waiting:
+        item = waiting.pop()
+        if not isinstance(item, Call) or id(item) in seen:
+            continue
+        seen.add(id(item))
+        with _malformed_is_told():
+            if (array := _array(item)) is not None:
+                return array
+        # A parameter or variable holds its tensor as first argument, or as part of its state.
+        waiting += reversed([*item.args, *(item.state if isinstance(item.state, tuple) else ())])
+    return None
+
+
+def _array(call: Call) -> NDArray[Any] | None:
+    """Return the array that the call itself would return, if that is one."""
+    name = call.function.name if isinstance(call.function, Global) else ""
     if name.startswith("_rebuild_tensor"):
-        storage, offset, size, stride = description.args[:4]
-        return _strided(_storage(storage), int(offset), size, stride)
-    if name == "_reconstruct" and isinstance(description.state, tuple):
-        return _numpy(description.state)
-    # A parameter or variable holds its tensor as first argument, or as part of its state.
-    inner = [*description.args, *(description.state if isinstance(description.state, tuple) else ())]
-    return next((array for item in inner if (array := tensor(item)) is not None), None)
+        storage, offset, size, stride = call.args[:4]
+        return _strided(_storage(storage), offset, size, stride)
+    if name == "_reconstruct" and isinstance(call.state, tuple):
+        _, shape, dtype, fortran, raw = call.state
+        return _numpy(raw, dtype, shape, "F" if fortran else "C")
+    if name == "_frombuffer":  # protocol 5
+        raw, dtype, shape, order = call.args[:4]
+        return _numpy(raw, dtype, shape, order)
+    return None
 
 
 def _strided(flat: NDArray[Any], offset: int, size: tuple[int, ...], stride: tuple[int, ...]) -> NDArray[Any]:
-    if any(n < 0 for n in (*size, *stride)) or offset < 0 or len(size) != len(stride):
+    if min(offset, *size, *stride) < 0 or len(size) != len(stride) or math.prod(size) > _MOST_NUMBERS:
         raise ExpertFileError(f"a tensor of size {size} and stride {stride} at {offset} cannot be")
     last = offset + sum((n - 1) * step for n, step in zip(size, stride, strict=True))
     if 0 not in size and last >= len(flat):
@@ -298,12 +334,11 @@ def _storage(description: Any) -> NDArray[Any]:
     """Return the entries of a described torch storage."""
     if isinstance(description, Call) and isinstance(description.function, Global):
         name, args = description.function.name, description.args
-        if name in _STORAGE_TYPES and args and isinstance(args[0], (list, tuple)):  # PyTorch before 1.0: a list
-            return np.array(args[0], _STORAGE_TYPES[name])
-        if name == "_load_from_bytes" and args and isinstance(args[0], bytes):
-            return _legacy_file(args[0])
-        if name == "TypedStorage" and args:
-            return _storage(args[0])
+        content = args[0] if args else None
+        if name in _STORAGE_TYPES and isinstance(content, list) and all(isinstance(n, (int, float)) for n in content):
+            return np.array(content, _STORAGE_TYPES[name])  # PyTorch before 1.0
+        if name == "_load_from_bytes" and isinstance(content, bytes):
+            return _legacy_file(content)
     raise ExpertFileError("a tensor's storage is written in a way that this reader does not know")
 
 
@@ -315,11 +350,11 @@ def _legacy_file(content: bytes) -> NDArray[Any]:
     """
     stream = BytesIO(content)
     pickles = _descriptions(stream)
-    _, _, system, described, keys = (next(pickles) for _ in range(5))
-    named = _find_persistent(described)
-    if named is None or len(keys) != 1 or not entries(system).get("little_endian", True):
+    magic, _, system, described, keys = (next(pickles) for _ in range(5))
+    whole = isinstance(described, Persistent) and not any(described.key[5:])  # the sixth tells of a part of a storage
+    if magic != _LEGACY_MAGIC or not whole or len(keys) != 1 or not entries(system).get("little_endian", True):
         raise ExpertFileError("a tensor's storage is not one little-endian array")
-    kind = named.key[1].name if isinstance(named.key[1], Global) else ""
+    kind = described.key[1].name if isinstance(described.key[1], Global) else ""
     if kind not in _STORAGE_TYPES:
         raise ExpertFileError(f"a tensor's storage is of the kind {kind!r}, which this reader does not know")
     count = int.from_bytes(stream.read(8), "little")
@@ -330,19 +365,13 @@ def _legacy_file(content: bytes) -> NDArray[Any]:
     return np.frombuffer(raw, dtype)
 
 
-def _find_persistent(description: Any) -> Persistent | None:
-    if isinstance(description, Persistent):
-        return description
-    inner = description.args if isinstance(description, Call) else ()
-    return next((found for item in inner if (found := _find_persistent(item)) is not None), None)
-
-
-def _numpy(state: tuple[Any, ...]) -> NDArray[Any]:
-    """Return the array of a NumPy array's pickled state: version, shape, dtype, Fortran order, bytes."""
-    _, shape, dtype, fortran, raw = state
+def _numpy(raw: Any, dtype: Any, shape: tuple[int, ...], order: Any) -> NDArray[Any]:
+    """Return the array of a NumPy array's pickled parts: bytes, described dtype, shape, order of the numbers."""
     code = dtype.args[0] if isinstance(dtype, Call) and dtype.args else ""
-    if isinstance(raw, str):
-        raw = raw.encode("latin-1")
-    if code not in ("f4", "f8", "i4", "i8") or not isinstance(raw, bytes):
-        raise ExpertFileError(f"an array of the type {code!r} is not one of plain numbers")
-    return np.frombuffer(raw, f"<{code}").reshape(shape, order="F" if fortran else "C").copy()
+    byte_order = dtype.state[1] if isinstance(dtype, Call) and isinstance(dtype.state, tuple) else ""
+    raw = raw.encode("latin-1") if isinstance(raw, str) else raw  # Python 2
+    if code not in ("f4", "f8", "i4", "i8") or byte_order not in ("<", ">") or not isinstance(raw, (bytes, bytearray)):
+        raise ExpertFileError("an array is not one of plain numbers")
+    if order not in ("C", "F"):
+        raise ExpertFileError("an array's numbers are in an order that this reader does not know")
+    return np.frombuffer(raw, f"{byte_order}{code}").reshape(shape, order=order).astype(f"<{code}")

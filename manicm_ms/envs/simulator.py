@@ -155,6 +155,7 @@ class EnvEntry:
         has_realism: whether it knows realism presets and camera files.
         preload: modules that take long to import and that worker processes may share; a missing one is no error.
         demos: which episodes of its expert become demonstrations.
+        group: column of the benchmark's table that it belongs to; empty for that of its suite.
     """
 
     spec: EnvSpec
@@ -166,6 +167,7 @@ class EnvEntry:
     has_realism: bool = True
     preload: tuple[str, ...] = ()
     demos: DemoRule = DemoRule()
+    group: str = ""
 
     def require(self, config: SimulatorConfig) -> None:
         """Raise ConfigError where `config` asks for what this environment does not have."""

@@ -32,7 +32,7 @@ def claimed_folder(out: Path, request: Mapping[str, Any]) -> Iterator[Path]:
         OutputExistsError: a folder that holds something else, or that another process writes.
         NoSpaceError: too little room on its disk.
     """
-    _require_same(out, request)
+    require_same_request(out, request)
     require_free_space(out, _NEED_BYTES)
     out.mkdir(parents=True, exist_ok=True)
 
@@ -40,20 +40,27 @@ def claimed_folder(out: Path, request: Mapping[str, Any]) -> Iterator[Path]:
         return OutputExistsError(f"{out} is being written by process {holder}: wait for it or choose another --out")
 
     with exclusive_lock(out / _LOCK_FILE, refuse):
-        _require_same(out, request)
+        require_same_request(out, request)
         write_json(out / RUN_FILE, dict(request))
         yield out
 
 
-def _require_same(out: Path, request: Mapping[str, Any]) -> None:
+def require_same_request(out: Path, request: Mapping[str, Any], file: str = RUN_FILE) -> None:
+    """Raise OutputExistsError unless the folder `out` is fresh or its `file` holds the same request.
+
+    Args:
+        out: the folder; it need not exist.
+        request: plain JSON values.
+        file: name of the file in it that holds the request of what is there.
+    """
     if not out.exists():
         return
     if not out.is_dir():
         raise OutputExistsError(f"{out} is a file: choose a folder for --out")
-    run_file = out / RUN_FILE
+    run_file = out / file
     if not run_file.exists():
         if any(path.name != _LOCK_FILE for path in out.iterdir()):
-            raise OutputExistsError(f"{out} holds other files and no {RUN_FILE}: choose another --out")
+            raise OutputExistsError(f"{out} holds other files and no {file}: choose another --out")
         return
     try:
         before = json.loads(run_file.read_text(encoding="utf-8"))
@@ -63,7 +70,7 @@ def _require_same(out: Path, request: Mapping[str, Any]) -> None:
     if differing:
         key = differing[0]
         raise OutputExistsError(
-            f"{out} already holds another evaluation ({', '.join(differing)} differ; {key} there: "
+            f"{out} already holds results of another request ({', '.join(differing)} differ; {key} there: "
             f"{_short(before.get(key))}, asked: {_short(request.get(key))}): choose another --out or remove the folder"
         )
 

@@ -6,7 +6,6 @@ import base64
 import io
 import re
 from collections.abc import Mapping, Sequence
-from importlib import resources
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -172,7 +171,7 @@ def summary_tables(results: Mapping[str, Any]) -> list[Table]:
 
 def render_markdown(results: Mapping[str, Any]) -> str:
     """Return the report as Markdown."""
-    return _template("report.md.j2", autoescape=False).render(**_context(results))
+    return template("report.md.j2", autoescape=False).render(**_context(results))
 
 
 def render_html(results: Mapping[str, Any], videos: Sequence[Mapping[str, Any]] = ()) -> str:
@@ -187,7 +186,7 @@ def render_html(results: Mapping[str, Any], videos: Sequence[Mapping[str, Any]] 
         source = "data:video/mp4;base64," + base64.b64encode(video["data"]).decode("ascii")
         scenes.setdefault(video["seed"], []).append({**video, "data": source})
     figures = {"success": success_plot(results), "latency": latency_plot(results)}
-    return _template("report.html.j2", autoescape=True).render(**_context(results), figures=figures, scenes=scenes)
+    return template("report.html.j2", autoescape=True).render(**_context(results), figures=figures, scenes=scenes)
 
 
 def write_report(results: Mapping[str, Any], out: Path) -> None:
@@ -289,9 +288,11 @@ def _context(results: Mapping[str, Any]) -> dict[str, Any]:
     }
 
 
-def _template(name: str, *, autoescape: bool) -> jinja2.Template:
-    text = resources.files("manicm_ms.evaluation").joinpath("templates", name).read_text(encoding="utf-8")
+def template(name: str, *, autoescape: bool, package: str = "manicm_ms.evaluation") -> jinja2.Template:
+    """Return a template of `package`; it may include those of this one."""
+    loaders = [jinja2.PackageLoader(name) for name in dict.fromkeys((package, "manicm_ms.evaluation"))]
     environment = jinja2.Environment(
-        autoescape=autoescape, undefined=jinja2.StrictUndefined, trim_blocks=True, lstrip_blocks=True
-    )
-    return environment.from_string(text)
+        loader=jinja2.ChoiceLoader(loaders), autoescape=autoescape, undefined=jinja2.StrictUndefined,
+        trim_blocks=True, lstrip_blocks=True,
+    )  # fmt: skip
+    return environment.get_template(name)

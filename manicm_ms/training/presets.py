@@ -103,6 +103,12 @@ TEACHER_PRESETS.add(
     ),
 )
 TEACHER_PRESETS.add(
+    "smoke",  # some seconds: shows that everything runs, and learns next to nothing
+    TeacherPreset(
+        steps=30, batch_size=16, warmup_steps=5, cloud_frame="auto", points=64, down_dims=(32, 64), save_every=15
+    ),
+)
+TEACHER_PRESETS.add(
     "paper",  # DP3's public configuration with the horizon of the ManiCM paper, section 4.1
     TeacherPreset(
         epochs=3000,
@@ -120,6 +126,7 @@ STUDENT_PRESETS.add(
     "quick",
     StudentPreset(steps=200, batch_size=64, learning_rate=5e-4, warmup_steps=50, clip_norm=1.0, save_every=100),
 )
+STUDENT_PRESETS.add("smoke", StudentPreset(steps=20, batch_size=16, warmup_steps=5, draws=1, save_every=10))
 STUDENT_PRESETS.add(
     "paper",  # ManiCM, section 4.1
     StudentPreset(

@@ -1,0 +1,92 @@
+"""Runs the jobs of a plan on a Ray cluster (extra `ray`): the same jobs, each a task that waits for those it needs.
+
+Every node needs this package installed and the plan's folders at the same path, on a shared file system.
+"""
+
+from __future__ import annotations
+
+import socket
+import sys
+from collections.abc import Callable, Sequence
+from typing import Any
+
+from rich.console import Console
+
+from manicm_ms.benchmark.jobs import Job, all_jobs
+from manicm_ms.benchmark.plan import Plan
+from manicm_ms.benchmark.pool import BLOCKED, BUSY, DONE, FAILED, attempt
+from manicm_ms.errors import BackendError
+from manicm_ms.paths import write_json
+
+_RETRIES = 3  # of a job whose node went away
+_POLL_S = 1.0
+
+
+def run_on_ray(plan: Plan, address: str, report: Callable[[Sequence[Job]], None]) -> dict[str, str]:
+    """Work the plan off on the cluster at `address`; "auto" is the one that this machine belongs to.
+
+    Args:
+        plan: the grid.
+        address: as `ray.init` takes it; "local" starts one on this machine.
+        report: called every second with the jobs that are done.
+
+    Returns:
+        job -> "done", "failed" or "blocked".
+
+    Raises BackendError where Ray is missing or no cluster answers.
+    """
+    ray = _ray()
+    if not ray.is_initialized():
+        try:
+            ray.init(address=address, log_to_driver=False, include_dashboard=False if address == "local" else None)
+        except (ConnectionError, ValueError, RuntimeError) as error:
+            raise BackendError(
+                f"no Ray cluster answers at {address!r} ({str(error).splitlines()[0]}): start one with "
+                "'ray start --head', or use --ray local"
+            ) from error
+    jobs, text = all_jobs(plan), plan.to_json()
+    remote = ray.remote(num_cpus=1, max_retries=_RETRIES)(_job_on_a_node)
+    running: dict[str, Any] = {}
+    for job in jobs:  # in an order in which needs come first
+        running[job.name] = remote.remote(text, job.name, *(running[need.name] for need in job.needs))
+    waiting = list(running.values())
+    try:
+        while waiting:
+            _, waiting = ray.wait(waiting, num_returns=len(waiting), timeout=_POLL_S, fetch_local=False)
+            report([job for job in jobs if job.is_done()])
+        return {name: _fate(ray, reference) for name, reference in running.items()}
+    except KeyboardInterrupt:
+        for reference in waiting:
+            ray.cancel(reference)
+        raise
+
+
+def _fate(ray: Any, reference: Any) -> str:
+    try:
+        return str(ray.get(reference))
+    except ray.exceptions.RayError:  # the node died more often than a job is tried again
+        return FAILED
+
+
+def _job_on_a_node(plan_json: str, name: str, *fates_of_needs: str) -> str:
+    """What a Ray task does."""
+    plan = Plan.from_json(plan_json)
+    job = next(job for job in all_jobs(plan) if job.name == name)
+    if job.is_done():
+        return DONE
+    if any(fate != DONE for fate in fates_of_needs):
+        return BLOCKED
+    fate = attempt(job, Console(file=sys.stderr, width=120))
+    if fate == BUSY:
+        reason = f"a process outside of this run works on it ({socket.gethostname()})"
+        write_json(job.failure_file, {"job": job.name, "reason": reason})
+        return FAILED
+    return fate
+
+
+def _ray() -> Any:
+    try:
+        import ray
+    except ImportError as error:
+        raise BackendError("--ray needs Ray: pip install 'manicm_ms[ray]', or leave it out") from error
+    return ray

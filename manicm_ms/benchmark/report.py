@@ -1,0 +1,156 @@
+"""Writes a benchmark's table as Markdown and as one self-contained page, and shows it on a terminal."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
+from typing import Any, NamedTuple
+
+from rich.table import Table
+
+from manicm_ms.evaluation.report import format_ms, template
+from manicm_ms.paths import write_json, write_text
+
+_PAPER_COLUMNS = ("adroit", "easy", "medium", "hard", "very-hard", "average", "ms")
+PAPER: Mapping[str, Mapping[str, float]] = {
+    method: dict(zip(_PAPER_COLUMNS, figures, strict=True))
+    for method, figures in {
+        "dp3": (76.1, 91.7, 46.3, 44.8, 62.3, 77.5, 177.6),
+        "simple_dp3": (73.0, 90.4, 47.3, 45.6, 56.5, 75.8, 120.6),
+        "manicm": (74.9, 92.9, 47.7, 44.2, 65.7, 78.5, 17.3),
+        "manicm_4": (78.2, 93.0, 48.0, 46.7, 64.5, 79.0, 66.2),
+    }.items()
+}
+"""Success rates in percent and decision times in milliseconds of ManiCM (arXiv:2406.01586), main table: 3000 epochs,
+31 tasks, the mean of the five highest evaluations, an RTX 4090."""
+
+
+class TextTable(NamedTuple):
+    """A table of text."""
+
+    title: str
+    headers: tuple[str, ...]
+    rows: list[tuple[str, ...]]
+
+
+def main_table(results: Mapping[str, Any]) -> TextTable:
+    """Return success by group and average on fresh seeds, with the 95 % interval, NFE and time of a decision."""
+
+    def shown(entry: Mapping[str, Any]) -> str:
+        spread = "" if entry["sd_over_seeds"] is None else f", sd {100 * entry['sd_over_seeds']:.1f}"
+        return f"{_percent(entry['success_rate'])} ({_interval(entry['ci95'])}{spread})"
+
+    return _by_group(
+        results, "Success on fresh seeds, % (95 % interval of the episodes, sd over training seeds)", shown
+    )
+
+
+def highest_table(results: Mapping[str, Any]) -> TextTable | None:
+    """Return the paper's mean of the five highest evaluations by group, or None where none were made."""
+
+    def shown(entry: Mapping[str, Any]) -> str:
+        return "-" if entry["mean_of_5_highest"] is None else _percent(entry["mean_of_5_highest"])
+
+    if not any(cell["mean_of_5_highest"] is not None for cell in results["cells"]):
+        return None
+    return _by_group(results, "The paper's mean of the five highest evaluations during training, %", shown)
+
+
+def _by_group(results: Mapping[str, Any], title: str, shown: Callable[[Mapping[str, Any]], str]) -> TextTable:
+    groups: dict[str, int] = {}
+    for row in results["rows"]:
+        for name, entry in row["groups"].items():
+            groups[name] = max(groups.get(name, 0), entry["tasks"])
+    headers = ("method", "NFE", *(f"{name} ({tasks})" for name, tasks in groups.items()), "average", "one decision")
+    lines = []
+    for row in results["rows"]:
+        entries = [row["groups"].get(name) for name in groups]
+        cells = ["-" if entry is None else shown(entry) for entry in (*entries, row["average"])]
+        time = "-" if row["decision_ms"] is None else format_ms(row["decision_ms"])
+        lines.append((row["method"], "-" if row["nfe"] is None else str(row["nfe"]), *cells, time))
+    return TextTable(title, headers, lines)
+
+
+def paper_table(results: Mapping[str, Any]) -> TextTable | None:
+    """Return the paper's own figures of the methods that it has, for the groups that the benchmark has."""
+    groups = list(dict.fromkeys(cell["group"] for cell in results["cells"]))
+    known = [name for name in groups if name in PAPER["dp3"]]
+    methods = [row["method"] for row in results["rows"] if row["method"] in PAPER]
+    if not known or not methods:
+        return None
+    lines = [
+        (m, *(f"{PAPER[m][name]:.1f}" for name in (*known, "average")), f"{PAPER[m]['ms']:.1f} ms") for m in methods
+    ]
+    return TextTable(
+        "The paper's figures, % (all tasks of a group)", ("method", *known, "average", "one decision"), lines
+    )
+
+
+def task_table(results: Mapping[str, Any]) -> TextTable:
+    """Return every task: successes of each method and its interval."""
+    methods = [row["method"] for row in results["rows"]]
+    cells = {(c["env_id"], c["method"]): c for c in results["cells"]}
+    lines = []
+    for env_id in results["env_ids"]:
+        mine = [cells[env_id, method] for method in methods]
+        lines.append((env_id, mine[0]["group"], *(_counted(c) for c in mine)))
+    return TextTable("By task, fresh seeds", ("task", "group", *methods), lines)
+
+
+def _counted(cell: Mapping[str, Any]) -> str:
+    if not cell["n"]:
+        return "-"
+    crashed = f", {cell['crashed']} crashed" if cell["crashed"] else ""
+    seeds = "/".join(f"{100 * rate:.0f}" for rate in cell["by_seed"].values())
+    by_seed = f"; seeds {seeds}" if len(cell["by_seed"]) > 1 else ""
+    return f"{cell['successes']}/{cell['n']} ({_interval(cell['ci95'])}{by_seed}{crashed})"
+
+
+def paired_lines(results: Mapping[str, Any]) -> list[str]:
+    """Return what the paired comparisons say, in words."""
+    lines = []
+    for pair in results["paired"]:
+        low, high = pair["difference_ci95"]
+        n = pair["both"] + pair["only_first"] + pair["only_second"] + pair["neither"]
+        lines.append(
+            f"{pair['second']} minus {pair['first']}, paired on the same {n} episodes of {pair['tasks']} tasks: "
+            f"{100 * pair['difference']:+.1f} points (95 % interval {100 * low:+.1f} to {100 * high:+.1f}; McNemar's "
+            f"exact test p = {pair['mcnemar_p']:.2g}; both {pair['both']}, only {pair['first']} {pair['only_first']}, "
+            f"only {pair['second']} {pair['only_second']}, neither {pair['neither']})."
+        )
+    return lines
+
+
+def write_benchmark(results: Mapping[str, Any], out: Path) -> None:
+    """Write results.json, report.md and report.html into `out`."""
+    context = {
+        "results": results,
+        "tables": [t for t in (main_table(results), highest_table(results), paper_table(results)) if t is not None]
+        + [task_table(results)],
+        "sentences": paired_lines(results),
+    }
+    write_json(out / "results.json", results)
+    package = "manicm_ms.benchmark"
+    write_text(out / "report.md", template("benchmark.md.j2", autoescape=False, package=package).render(context))
+    write_text(out / "report.html", template("benchmark.html.j2", autoescape=True, package=package).render(context))
+
+
+def rich_tables(results: Mapping[str, Any]) -> list[Table]:
+    """Return the main tables for a terminal."""
+    found = []
+    for text in (main_table(results), highest_table(results), task_table(results)):
+        if text is None:
+            continue
+        table = Table(*text.headers, title=text.title)
+        for row in text.rows:
+            table.add_row(*row)
+        found.append(table)
+    return found
+
+
+def _percent(rate: float) -> str:
+    return f"{100 * rate:.1f}"
+
+
+def _interval(ci95: Sequence[float]) -> str:
+    return f"{100 * ci95[0]:.0f} to {100 * ci95[1]:.0f}"
