@@ -89,11 +89,17 @@ class Job(ABC):
         found: dict[str, Any] = json.loads(self.result_file.read_text(encoding="utf-8"))
         return found
 
-    def complete(self, console: Console) -> None:
-        """Do the work and write the result; after this returns the job is done."""
+    def complete(self, console: Console, place: str) -> None:
+        """Do the work and write the result; after this returns the job is done.
+
+        Args:
+            console: where progress goes.
+            place: who does it, for the record.
+        """
         began = time.perf_counter()
         result = self.work(console)
-        write_json(self.result_file, {"job": self.name, "seconds": round(time.perf_counter() - began, 1), **result})
+        seconds = round(time.perf_counter() - began, 1)
+        write_json(self.result_file, {"job": self.name, "place": place, "seconds": seconds, **result})
         self.failure_file.unlink(missing_ok=True)
 
 
@@ -202,9 +208,9 @@ class JudgeJob(Job):
             "evaluations": evaluations,
         }
 
-    def complete(self, console: Console) -> None:
+    def complete(self, console: Console, place: str) -> None:
         """Do the work and write the result; then remove the snapshots that it was the only one to need."""
-        super().complete(console)
+        super().complete(console, place)
         if self.method.trains:
             checkpoint = self.plan.checkpoint(self.env_id, self.seed, self.method)
             for folder in snapshot_folders(checkpoint).values():

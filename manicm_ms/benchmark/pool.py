@@ -11,6 +11,7 @@ import logging
 import multiprocessing
 import os
 import signal
+import socket
 import threading
 import time
 from collections.abc import Callable, Iterator, Sequence
@@ -32,8 +33,13 @@ class _TakenError(ManicmError):
     """Another process works on the job."""
 
 
-def attempt(job: Job, console: Console) -> str:
+def attempt(job: Job, console: Console, place: str | None = None) -> str:
     """Do a job whose needs are done, unless another process is at it.
+
+    Args:
+        job: the job.
+        console: where progress goes.
+        place: who does it, for the record; by default this machine and process.
 
     Returns:
         `DONE`, `FAILED` (its failure file says why) or `BUSY`.
@@ -43,7 +49,7 @@ def attempt(job: Job, console: Console) -> str:
         with exclusive_lock(job.lock_file, lambda holder: _TakenError(holder)):
             if not job.is_done():
                 console.print(f"{job.name}: begun", highlight=False)
-                job.complete(console)
+                job.complete(console, place or f"{socket.gethostname()}, process {os.getpid()}")
     except _TakenError:
         return BUSY
     except KeyboardInterrupt:

@@ -20,6 +20,7 @@ from manicm_ms.paths import write_json
 
 _RETRIES = 3  # of a job whose node went away
 _POLL_S = 1.0
+_ANSWER_S = 5.0
 
 
 def run_on_ray(plan: Plan, address: str, report: Callable[[Sequence[Job]], None]) -> dict[str, str]:
@@ -37,13 +38,11 @@ def run_on_ray(plan: Plan, address: str, report: Callable[[Sequence[Job]], None]
     """
     ray = _ray()
     if not ray.is_initialized():
+        _require_answer(address)
         try:
             ray.init(address=address, log_to_driver=False, include_dashboard=False if address == "local" else None)
         except (ConnectionError, ValueError, RuntimeError) as error:
-            raise BackendError(
-                f"no Ray cluster answers at {address!r} ({str(error).splitlines()[0]}): start one with "
-                "'ray start --head', or use --ray local"
-            ) from error
+            raise _no_cluster(address, str(error).splitlines()[0]) from error
     jobs, text = all_jobs(plan), plan.to_json()
     remote = ray.remote(num_cpus=1, max_retries=_RETRIES)(_job_on_a_node)
     running: dict[str, Any] = {}
@@ -61,6 +60,23 @@ def run_on_ray(plan: Plan, address: str, report: Callable[[Sequence[Job]], None]
         raise
 
 
+def _require_answer(address: str) -> None:
+    """Raise BackendError where nobody listens at HOST:PORT, which Ray would wait minutes for."""
+    host, _, port = address.partition(":")
+    if not port.isdecimal():
+        return
+    try:
+        socket.create_connection((host, int(port)), _ANSWER_S).close()
+    except OSError as error:
+        raise _no_cluster(address, str(error)) from error
+
+
+def _no_cluster(address: str, reason: str) -> BackendError:
+    return BackendError(
+        f"no Ray cluster answers at {address!r} ({reason}): start one with 'ray start --head', or use --ray local"
+    )
+
+
 def _fate(ray: Any, reference: Any) -> str:
     try:
         return str(ray.get(reference))
@@ -76,7 +92,8 @@ def _job_on_a_node(plan_json: str, name: str, *fates_of_needs: str) -> str:
         return DONE
     if any(fate != DONE for fate in fates_of_needs):
         return BLOCKED
-    fate = attempt(job, Console(file=sys.stderr, width=120))
+    node = f"Ray node {_ray().get_runtime_context().get_node_id()}"
+    fate = attempt(job, Console(file=sys.stderr, width=120), node)
     if fate == BUSY:
         reason = f"a process outside of this run works on it ({socket.gethostname()})"
         write_json(job.failure_file, {"job": job.name, "reason": reason})

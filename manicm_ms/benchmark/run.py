@@ -85,7 +85,7 @@ def benchmark(
 
 def _claim(plan: Plan) -> None:
     """Write down what results in `out` depend on, or raise OutputExistsError where they depend on something else."""
-    require_same_request(plan.out, plan.identity, PLAN_FILE)
+    require_same_request(plan.out, plan.identity, PLAN_FILE, "benchmark")
     plan.out.mkdir(parents=True, exist_ok=True)
     write_json(plan.out / PLAN_FILE, plan.identity)
 

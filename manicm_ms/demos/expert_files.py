@@ -165,7 +165,7 @@ def _download(file: ExpertFile, url: str, sha256: str) -> bytes:
         with urllib.request.urlopen(url, timeout=_TIMEOUT_S) as response:
             content = response.read(_MOST_BYTES)
     except (OSError, http.client.HTTPException, ValueError) as error:  # URLError is an OSError
-        reason = getattr(error, "reason", None) or error
+        reason = str(getattr(error, "reason", None) or error).strip()
         raise ExpertFileError(
             f"{url} cannot be fetched ({reason}): try again later, or give a folder that holds "
             f"{file.path.name} with 'manicm-ms experts fetch --from FOLDER'"

@@ -106,4 +106,5 @@ class RowwiseExpertFactory:
     def __call__(self, spec: EnvSpec, num_envs: int, device: torch.device, style: str | None) -> RowwiseExpert:
         """See `ExpertFactory`."""
         del spec, num_envs, device
-        return RowwiseExpert(self.load(), self.name, require_style(style, self.styles))
+        chosen = require_style(style, self.styles)
+        return RowwiseExpert(self.load(), self.name, chosen)

@@ -321,7 +321,7 @@ def _array(call: Call) -> NDArray[Any] | None:
 
 
 def _strided(flat: NDArray[Any], offset: int, size: tuple[int, ...], stride: tuple[int, ...]) -> NDArray[Any]:
-    if min(offset, *size, *stride) < 0 or len(size) != len(stride) or math.prod(size) > _MOST_NUMBERS:
+    if min((offset, *size, *stride)) < 0 or len(size) != len(stride) or math.prod(size) > _MOST_NUMBERS:
         raise ExpertFileError(f"a tensor of size {size} and stride {stride} at {offset} cannot be")
     last = offset + sum((n - 1) * step for n, step in zip(size, stride, strict=True))
     if 0 not in size and last >= len(flat):

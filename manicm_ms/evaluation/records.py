@@ -45,13 +45,14 @@ def claimed_folder(out: Path, request: Mapping[str, Any]) -> Iterator[Path]:
         yield out
 
 
-def require_same_request(out: Path, request: Mapping[str, Any], file: str = RUN_FILE) -> None:
+def require_same_request(out: Path, request: Mapping[str, Any], file: str = RUN_FILE, kind: str = "evaluation") -> None:
     """Raise OutputExistsError unless the folder `out` is fresh or its `file` holds the same request.
 
     Args:
         out: the folder; it need not exist.
         request: plain JSON values.
         file: name of the file in it that holds the request of what is there.
+        kind: what a request is called in a message.
     """
     if not out.exists():
         return
@@ -70,7 +71,7 @@ def require_same_request(out: Path, request: Mapping[str, Any], file: str = RUN_
     if differing:
         key = differing[0]
         raise OutputExistsError(
-            f"{out} already holds results of another request ({', '.join(differing)} differ; {key} there: "
+            f"{out} already holds another {kind} ({', '.join(differing)} differ; {key} there: "
             f"{_short(before.get(key))}, asked: {_short(request.get(key))}): choose another --out or remove the folder"
         )
 

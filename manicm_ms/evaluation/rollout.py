@@ -126,7 +126,8 @@ def rollout(
     1. A row without an episode takes the next seed and is reset; the other rows go on undisturbed.
     2. The policy decides for all N rows at once, idle ones included, so that the batch keeps one size.
        Row i's noise is a function of its episode's seed and the number of the decision alone.
-    3. The env plays the chunk in all rows. Rows that ended give their result; back to 1.
+    3. The env plays the chunk in all rows. Rows that ended give their result; back to 1. Where success at some step
+       is enough (`success_rule` "any"), a row that has seen it has ended, whether or not the env goes on.
     4. A row whose simulation or policy fails (error in the env, also at its reset, or an action that is not
        finite) is a failed episode with its reason. If the env itself dies (BackendError), all episodes in
        flight are failed ones; a `RestartableEnv` is restarted and the remaining seeds go on, any other env ends the
@@ -265,14 +266,15 @@ class _Rollout:
         rewards = _numpy(reward)
         ended = _numpy(terminated) | _numpy(truncated)
         steps = _numpy(info["elapsed_steps"])
-        success = _numpy(info["success_once" if self.env.env_spec.success_rule == "any" else "success"])
+        any_step = self.env.env_spec.success_rule == "any"
+        success = _numpy(info["success_once" if any_step else "success"])
         for i, episode in enumerate(self.rows):
             if episode is None:
                 continue
             episode.total_return += float(np.nan_to_num(rewards[i]))
             episode.steps = int(steps[i])
             error = info["error"][i]
-            if ended[i] or error is not None:
+            if ended[i] or error is not None or (any_step and success[i]):
                 self._end(i, bool(success[i]), error)
 
     def _end(self, row: int, success: bool, crashed: str | None) -> None:

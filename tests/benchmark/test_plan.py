@@ -1,0 +1,112 @@
+"""What a benchmark may be asked: names, seeds, methods and their teachers."""
+
+from pathlib import Path
+
+import pytest
+
+from manicm_ms.benchmark.jobs import all_jobs
+from manicm_ms.benchmark.methods import OneStep, Student, Teacher, parse_methods
+from manicm_ms.benchmark.plan import Plan, parse_envs, parse_seeds
+from manicm_ms.errors import ConfigError, UnknownNameError
+
+
+def plan(**changes):
+    fields = {
+        "env_ids": ("metaworld/reach", "adroit/door"), "methods": ("simple_dp3", "one_step", "manicm"), "seeds": (0, 1),
+        "preset": "smoke", "out": Path("runs/x"), "data": Path("data"),
+    }  # fmt: skip
+    return Plan(**{**fields, **changes})
+
+
+def test_students_and_controls_come_from_the_one_teacher_named_or_from_the_default():
+    assert parse_methods(["dp3", "manicm", "one_step"]) == (
+        Teacher("dp3"), Student("manicm", Teacher("dp3"), 1), OneStep("one_step", Teacher("dp3")),
+    )  # fmt: skip
+    assert parse_methods(["manicm_4"]) == (Student("manicm_4", Teacher("simple_dp3"), 4),)
+    both = parse_methods(["dp3", "simple_dp3", "manicm:dp3", "manicm:simple_dp3"])
+    assert [m.made_from.name for m in both if m.made_from] == ["dp3", "simple_dp3"]
+
+
+@pytest.mark.parametrize(
+    ("names", "error", "text"),
+    [
+        ([], ConfigError, "name each method once"),
+        (["manicm", "manicm"], ConfigError, "name each method once"),
+        (["dp3", "simple_dp3", "manicm"], ConfigError, "manicm:dp3 or manicm:simple_dp3"),
+        (["dp3:simple_dp3"], ConfigError, "trained on demonstrations"),
+        (["manicm:bc"], UnknownNameError, "unknown teacher 'bc'"),
+        (["simple_dp"], UnknownNameError, "did you mean 'simple_dp3'"),
+    ],
+)
+def test_methods_that_cannot_be_are_refused_with_a_way_out(names, error, text):
+    with pytest.raises(error, match=text):
+        parse_methods(names)
+
+
+def test_tags_and_ids_mix_and_each_task_comes_once():
+    assert parse_envs("adroit") == ("adroit/door", "adroit/hammer", "adroit/pen")
+    assert parse_envs("metaworld/soccer, adroit,adroit/door") == ("metaworld/soccer", *parse_envs("adroit"))
+    assert len(parse_envs("benchmark31")) == 31
+    with pytest.raises(UnknownNameError, match="did you mean 'metaworld/soccer'"):
+        parse_envs("metaworld/socker")
+    with pytest.raises(UnknownNameError, match="called 'metaworld/button-press' here"):
+        parse_envs("button-press-v2")
+
+
+def test_seeds_are_whole_numbers():
+    assert parse_seeds("0, 1,22") == (0, 1, 22)
+    for text in ("", "0,x", "-1", "0.5"):
+        with pytest.raises(ConfigError, match="whole numbers"):
+            parse_seeds(text)
+
+
+@pytest.mark.parametrize(
+    ("changes", "text"),
+    [
+        ({"episodes": 0}, "at least 1"),
+        ({"evaluations": -1}, "at least 0"),
+        ({"seeds": (0, 0)}, "once"),
+        ({"env_ids": ()}, "at least one task"),
+        ({"eval_seed": -5}, "negative"),
+    ],
+)
+def test_numbers_out_of_range_are_refused(changes, text):
+    with pytest.raises(ConfigError, match=text):
+        plan(**changes)
+    with pytest.raises(UnknownNameError, match="preset"):
+        plan(preset="papers")
+
+
+def test_a_plan_survives_its_way_through_json():
+    there = plan(colors=True, evaluations=5)
+    back = Plan.from_json(there.to_json())
+    assert back.identity == there.identity
+    assert (back.env_ids, back.methods, back.seeds) == (there.env_ids, there.methods, there.seeds)
+    assert back.out == there.out.resolve()
+
+
+def test_no_episode_of_an_evaluation_is_played_by_another_one_or_among_the_fresh_ones():
+    asked = plan(evaluations=12)
+    seeds = [s for number in range(12) for s in asked.evaluation_seeds(number)]
+    assert len(set(seeds)) == len(seeds) == 12 * 20
+    assert not set(seeds) & set(asked.fresh_seeds)
+
+
+def test_every_job_stands_after_those_it_needs_and_once():
+    jobs = all_jobs(plan())
+    names = [job.name for job in jobs]
+    assert len(set(names)) == len(names) == 2 + 2 * 2 * (2 + 3), "collect per task; 2 trainings, 3 judged per seed"
+    for k, job in enumerate(jobs):
+        assert {need.name for need in job.needs} <= set(names[:k])
+    student = next(job for job in jobs if job.name == "adroit/door/seed1/manicm/train")
+    assert {need.name for need in student.needs} == {"adroit/door/collect", "adroit/door/seed1/simple_dp3/train"}
+
+
+def test_a_student_alone_brings_its_teachers_training_but_not_its_judgement():
+    names = {job.name for job in all_jobs(plan(env_ids=("adroit/door",), methods=("manicm",), seeds=(0,)))}
+    assert names == {
+        "adroit/door/collect",
+        "adroit/door/seed0/simple_dp3/train",
+        "adroit/door/seed0/manicm/train",
+        "adroit/door/seed0/manicm/judge",
+    }
