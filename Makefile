@@ -25,4 +25,5 @@ lint: setup
 	$(PY) -m mypy
 
 clean:
-	rm -rf .venv .vulkan .vulkan.new .setup-lock manicm_ms.egg-info build dist .mypy_cache .ruff_cache .pytest_cache
+	rm -rf .venv .vulkan .vulkan.new .mujoco_gl .mujoco_gl.new .setup-lock manicm_ms.egg-info build dist .mypy_cache \
+		.ruff_cache .pytest_cache

@@ -4,6 +4,14 @@ MuJoCo reads MUJOCO_GL while it is imported and, left alone, takes GLFW, which n
 first that this machine has: EGL (a GPU's, or Mesa's software renderer), else OSMesa, else "disabled": physics then
 works and rendering raises RenderDeviceError. A choice that the user made stays.
 
+Where `make setup` had no root to install an OpenGL with, it unpacked one into `.mujoco_gl/` and left a manifest,
+`.mujoco_gl/mujoco_gl.json`, which then comes first (paths relative to the folder)::
+
+    {"gl": "egl", "preload": ["root/usr/lib/x86_64-linux-gnu/libGLdispatch.so.0", ...],
+     "environment": {"__EGL_VENDOR_LIBRARY_FILENAMES": "root/usr/share/glvnd/egl_vendor.d/50_mesa.json", ...}}
+
+`MANICM_MS_MUJOCO_GL` names another folder with such a manifest, or is `system` to ignore all of them.
+
 Run as a module, it ends with status 0 where EGL opens without a screen, else 1.
 """
 
@@ -11,15 +19,20 @@ from __future__ import annotations
 
 import ctypes
 import importlib
+import json
 import os
 import subprocess
 import sys
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
+from manicm_ms import private_libraries
 from manicm_ms.errors import RenderDeviceError
 
 VARIABLE = "MUJOCO_GL"
+FOLDER_VARIABLE = "MANICM_MS_MUJOCO_GL"
+MANIFEST = "mujoco_gl.json"
 DISABLED = "disabled"
 CHOICES = ("egl", "osmesa", "glfw", DISABLED)
 REMEDY = "run 'make setup FORCE=1' in the repository, or as root 'apt install libegl1 libgl1' (or libosmesa6)"
@@ -51,13 +64,16 @@ def prepare() -> str:
 
     Call it before mujoco is first imported. Calling twice is fine.
 
-    Raises RenderDeviceError where MUJOCO_GL names something else, or a library that is not here.
+    Raises RenderDeviceError where MUJOCO_GL names something else, or a library that is not here, and where the manifest
+    of a private OpenGL is broken.
     """
     # Threads of Mesa's rasteriser do not survive a fork, and are no faster at the size of an observation.
     os.environ.setdefault("LP_NUM_THREADS", "0")
     named = os.environ.get(VARIABLE, "").strip().lower()
     if named and named not in CHOICES:
         raise RenderDeviceError(f"{VARIABLE}={named} is none of {', '.join(CHOICES)}: unset it, or name one of them")
+    if named in ("", *_LIBRARIES) and _use_private(named):
+        return os.environ[VARIABLE]
     if named in _LIBRARIES and not _library(*_LIBRARIES[named]):
         raise RenderDeviceError(f"{VARIABLE}={named}, but {_LIBRARIES[named][0]} is not here: unset it; {REMEDY}")
     if not named:
@@ -92,6 +108,43 @@ def probe(timeout_s: float = 120) -> Probe:
     lines = (done.stdout if done.returncode == 0 else done.stderr).strip().splitlines()
     last = lines[-1] if lines else f"the trial rendering ended with status {done.returncode}"
     return Probe(True, device=last) if done.returncode == 0 else Probe(False, reason=last)
+
+
+def _use_private(named: str) -> bool:
+    """Load the OpenGL that set-up unpacked, for this process and its children; return False where it is not wanted.
+
+    It is not where there is none, where the user `named` another kind, and where a variable that it needs is theirs.
+    """
+    where = private_libraries.folder(FOLDER_VARIABLE, ".mujoco_gl", MANIFEST)
+    if where is None:
+        return False
+    choice, preload, environment = _read_manifest(where / MANIFEST)
+    theirs = any(os.environ.get(key, value) != value for key, value in environment.items())
+    if theirs or named not in ("", choice):
+        return False
+    try:
+        private_libraries.load(preload)
+    except OSError as error:
+        raise RenderDeviceError(f"the private OpenGL does not load ({error}): {REMEDY}") from error
+    os.environ.update({**environment, VARIABLE: choice})
+    return True
+
+
+def _read_manifest(path: Path) -> tuple[str, list[str], dict[str, str]]:
+    """Return the kind of OpenGL, the libraries to load and the variables to set."""
+    try:
+        manifest = json.loads(path.read_text(encoding="utf-8"))
+        choice = manifest["gl"]
+        preload = [str(path.parent / p) for p in manifest["preload"]]
+        environment = {key: str(path.parent / p) for key, p in manifest["environment"].items()}
+    except (OSError, ValueError, KeyError, TypeError, AttributeError) as error:
+        raise RenderDeviceError(f"{path} cannot be read ({error}): {REMEDY}") from error
+    if choice not in _LIBRARIES:
+        raise RenderDeviceError(f"{path} names {choice!r}, which is none of {', '.join(_LIBRARIES)}: {REMEDY}")
+    missing = [p for p in (*preload, *environment.values()) if not Path(p).exists()]
+    if missing:
+        raise RenderDeviceError(f"{path} names {missing[0]}, which does not exist: {REMEDY}")
+    return choice, preload, environment
 
 
 def _library(*names: str) -> ctypes.CDLL | None:

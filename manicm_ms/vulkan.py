@@ -15,7 +15,6 @@ Run as a module, it renders one tiny picture and prints the device's name.
 
 from __future__ import annotations
 
-import ctypes
 import json
 import os
 import subprocess
@@ -24,10 +23,10 @@ import warnings
 from dataclasses import dataclass
 from pathlib import Path
 
+from manicm_ms import private_libraries
 from manicm_ms.errors import RenderDeviceError
 
 FOLDER_VARIABLE = "MANICM_MS_VULKAN"
-USE_SYSTEM = "system"
 MANIFEST = "vulkan.json"
 REMEDY = "run 'make setup FORCE=1' in the repository, or install an NVIDIA driver or Mesa's lavapipe 24.3 or newer"
 
@@ -35,7 +34,6 @@ _DRIVER_VARIABLE = "VK_DRIVER_FILES"
 _PROBE_PIXELS = 8
 _PROBE_BOX_M = 0.1  # half size of the box that is looked at
 _PROBE_RANGE_M = 1.0  # camera to box centre
-_loaded: list[ctypes.CDLL] = []  # kept: an unloaded library would not satisfy the driver
 
 
 @dataclass(frozen=True)
@@ -58,17 +56,7 @@ def folder() -> Path | None:
 
     Raises RenderDeviceError where `MANICM_MS_VULKAN` names a folder without a manifest.
     """
-    named = os.environ.get(FOLDER_VARIABLE)
-    if named == USE_SYSTEM:
-        return None
-    if named:
-        if not (Path(named) / MANIFEST).is_file():
-            raise RenderDeviceError(
-                f"{FOLDER_VARIABLE}={named} holds no {MANIFEST}: unset it or name a folder that 'make setup' made"
-            )
-        return Path(named)
-    beside = Path(__file__).resolve().parents[1] / ".vulkan"
-    return beside if (beside / MANIFEST).is_file() else None
+    return private_libraries.folder(FOLDER_VARIABLE, ".vulkan", MANIFEST)
 
 
 def prepare() -> None:
@@ -81,13 +69,11 @@ def prepare() -> None:
     where = folder()
     if where is None:
         return
-    where = where.absolute()
     driver, preload = _read_manifest(where / MANIFEST)
     chosen = os.environ.get(_DRIVER_VARIABLE) or os.environ.get("VK_ICD_FILENAMES")
     if chosen and chosen != driver:
         return
-    if not _loaded:
-        _load(preload)
+    _load(preload)
     os.environ[_DRIVER_VARIABLE] = driver
     warnings.filterwarnings("ignore", message="Failed to find system libvulkan")  # SAPIEN's own does as well
 
@@ -105,16 +91,10 @@ def _read_manifest(path: Path) -> tuple[str, list[str]]:
 
 
 def _load(libraries: list[str]) -> None:
-    """Load the driver's own libraries by path, each after those it needs.
-
-    The dynamic linker takes a library that is loaded under the same soname before it searches, so
-    this does what LD_LIBRARY_PATH would have done, had it been set before the process started.
-    """
-    for path in libraries:
-        try:
-            _loaded.append(ctypes.CDLL(path))
-        except OSError as error:
-            raise RenderDeviceError(f"the private Vulkan driver does not load ({error}): {REMEDY}") from error
+    try:
+        private_libraries.load(libraries)
+    except OSError as error:
+        raise RenderDeviceError(f"the private Vulkan driver does not load ({error}): {REMEDY}") from error
 
 
 def probe(python: str = sys.executable, timeout_s: float = 120.0) -> Probe:

@@ -19,8 +19,9 @@ inputs_sum() { cat $INPUTS | cksum; }
 up_to_date() {
     [ -z "${FORCE:-}" ] && [ -x $VENV/bin/python ] && [ -f $STAMP ] || return 1
     [ "$(head -n 1 $STAMP)" = "$(inputs_sum) $PWD" ] || return 1
-    driver=$(sed -n 2p $STAMP) # the driver file that rendered then must still be there
-    [ -z "$driver" ] || [ -e "$driver" ]
+    sed 1d $STAMP | while read -r driver; do # the driver files that rendered then must still be there
+        [ -e "$driver" ] || exit 1
+    done
 }
 
 suitable() { "$1" -c 'import sys; sys.exit(not (3, 11) <= sys.version_info[:2] <= (3, 13))' 2>/dev/null; }
@@ -100,8 +101,9 @@ prefer_headless_opencv() {
     pip_install --force-reinstall --no-deps opencv-python-headless && grep -q '^headless = True' "$version_file"
 }
 
-# The file whose disappearance means that rendering must be set up anew.
-driver_file() {
+# The files whose disappearance means that rendering must be set up anew.
+driver_files() {
+    if [ -e .mujoco_gl/mujoco_gl.json ]; then echo .mujoco_gl/mujoco_gl.json; fi
     for file in .vulkan/vulkan.json /dev/nvidiactl /usr/share/vulkan/icd.d/lvp_icd*.json; do
         if [ -e "$file" ]; then echo "$file"; return; fi
     done
@@ -118,6 +120,6 @@ if ! venv_works; then make_venv; fi
 install_packages
 $VENV/bin/python scripts/setup_vulkan.py $VENV/bin/python
 $VENV/bin/python scripts/setup_mujoco.py $VENV/bin/python
-{ echo "$(inputs_sum) $PWD"; driver_file; } >$STAMP.new
+{ echo "$(inputs_sum) $PWD"; driver_files; } >$STAMP.new
 mv $STAMP.new $STAMP
 say "done"

@@ -23,6 +23,7 @@ import re
 import shutil
 import subprocess
 import sys
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -181,9 +182,9 @@ class Apt:
         only_backports = all(f"{codename}-backports" in suite for suite in new)
         return ("-t", f"{codename}-backports") if only_backports else ()
 
-    def install(self, *arguments: str) -> None:
-        """Install the Vulkan packages (with `--download-only`: fetch them and what they lack here)."""
-        run(["apt-get", *self.options, "install", "-y", "--no-install-recommends", *arguments, *PACKAGES])
+    def install(self, packages: tuple[str, ...], *arguments: str) -> None:
+        """Install `packages` (with `--download-only`: fetch them and what they lack here)."""
+        run(["apt-get", *self.options, "install", "-y", "--no-install-recommends", *arguments, *packages])
 
 
 NO_MESA = (
@@ -221,7 +222,7 @@ def install_as_root(codename: str) -> None:
     apt = Apt()
     target = update_until_found(apt, codename, Path("/etc/apt/sources.list.d") / BACKPORTS_FILE)
     say(f"installing {' and '.join(PACKAGES)} with apt")
-    apt.install(*target)
+    apt.install(PACKAGES, *target)
 
 
 # ---------------------------------------------------------------- without root
@@ -253,17 +254,27 @@ def private_apt(folder: Path, codename: str) -> tuple[Apt, Path]:
 def unpack_privately(python: str, codename: str) -> None:
     """Fetch the Vulkan packages with what they need and unpack them into `.vulkan/`, without root."""
     fresh = PRIVATE.with_name(".vulkan.new")
-    shutil.rmtree(fresh, ignore_errors=True)
-    apt, sources = private_apt(fresh / "apt", codename)
-    target = update_until_found(apt, codename, sources / BACKPORTS_FILE)
     say("fetching Mesa's Vulkan driver and what it needs (about 40 to 100 MB)")
-    apt.install("--download-only", *target)
-    for package in sorted((fresh / "apt" / "cache" / "archives").glob("*.deb")):
-        run(["dpkg-deb", "-x", str(package), str(fresh / "root")])
-    shutil.rmtree(fresh / "apt")
+    unpack(PACKAGES, fresh, codename, update_until_found)
     write_private_manifest(python, fresh)
     shutil.rmtree(PRIVATE, ignore_errors=True)
     fresh.rename(PRIVATE)
+
+
+def unpack(
+    packages: tuple[str, ...], fresh: Path, codename: str, choose: Callable[[Apt, str, Path], tuple[str, ...]]
+) -> None:
+    """Fetch `packages` with what they lack here and unpack them into `fresh`/root, without root.
+
+    `choose` reads the package lists and returns the apt arguments that select a suite, as `update_until_found` does.
+    """
+    shutil.rmtree(fresh, ignore_errors=True)
+    apt, sources = private_apt(fresh / "apt", codename)
+    target = choose(apt, codename, sources / BACKPORTS_FILE)
+    apt.install(packages, "--download-only", *target)
+    for package in sorted((fresh / "apt" / "cache" / "archives").glob("*.deb")):
+        run(["dpkg-deb", "-x", str(package), str(fresh / "root")])
+    shutil.rmtree(fresh / "apt")
 
 
 def write_private_manifest(python: str, folder: Path) -> None:
@@ -278,25 +289,30 @@ def write_private_manifest(python: str, folder: Path) -> None:
     driver = json.loads(drivers[0].read_text())
     driver["ICD"]["library_path"] = f"./{library.relative_to(folder)}"  # the loader reads it relative to the file
     (folder / "lvp_icd.json").write_text(json.dumps(driver, indent=2) + "\n")
-    preload = [str(p.relative_to(folder)) for p in load_order(python, private_needs(library, folder))]
-    write_manifest(folder, "lvp_icd.json", preload)
+    x11 = list(folder.glob("root/usr/lib/**/libX11.so.6"))  # there where the system lacks it; SAPIEN needs it
+    write_manifest(folder, "lvp_icd.json", preload_list(python, x11, [library], folder))
 
 
-def private_needs(library: Path, folder: Path) -> list[Path]:
-    """Return the libraries in `folder` that the driver `library` and SAPIEN need, as the linker finds them there."""
-    places = sorted({str(p.parent) for p in folder.glob("root/usr/lib/**/*.so*")})
+def preload_list(python: str, libraries: list[Path], drivers: list[Path], folder: Path) -> list[str]:
+    """Return `libraries` of `folder` and what they and `drivers` need there, relative to it, each after its needs."""
+    wanted = dict.fromkeys([*libraries, *private_needs([*libraries, *drivers], folder)])
+    return [str(p.relative_to(folder)) for p in load_order(python, list(wanted))]
+
+
+def private_needs(libraries: list[Path], folder: Path) -> list[Path]:
+    """Return the libraries in `folder` that `libraries` need, as the linker finds them there."""
+    places = sorted({str(p.parent) for p in folder.glob("root/**/*.so*")})
     env = {**os.environ, "LD_LIBRARY_PATH": ":".join(places)}
-    wanted = [library, *folder.glob("root/usr/lib/**/libX11.so.6")]  # the second is there where the system lacks it
     text = "".join(
         subprocess.run(["ldd", str(path)], text=True, capture_output=True, env=env, check=False).stdout
-        for path in wanted
+        for path in libraries
     )
     missing = sorted(set(re.findall(r"(\S+) => not found", text)))
     if missing:
         raise SetupError(
-            f"the private Vulkan driver needs {', '.join(missing)}: install it, or run 'make setup' as root"
+            f"the packages in {folder} also need {', '.join(missing)}: install it, or run 'make setup' as root"
         )
-    found = [*wanted[1:], *(Path(p) for p in re.findall(r"=> (/\S+)", text))]
+    found = [Path(p) for p in re.findall(r"=> (/\S+)", text)]
     return [p for p in dict.fromkeys(found) if p.is_relative_to(folder) and not p.name.startswith(RUNTIME)]
 
 

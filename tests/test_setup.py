@@ -1,6 +1,7 @@
 """The set-up scripts: apt's configuration in both formats, and a stamp that knows when to start anew."""
 
 import importlib.util
+import json
 import os
 import shutil
 import subprocess
@@ -214,47 +215,127 @@ def test_an_unsuitable_python_is_refused(checkout, tmp_path):
     assert run_setup(checkout, PYTHON=str(tmp_path / "old")) == (1, "")
 
 
+def test_a_private_opengl_that_is_gone_is_noticed(checkout):
+    manifest = checkout / ".mujoco_gl" / "mujoco_gl.json"
+    manifest.parent.mkdir()
+    manifest.touch()
+    assert run_setup(checkout)[0] == 0
+    assert run_setup(checkout) == (0, "")
+    manifest.unlink()
+    assert "setup_mujoco.py" in run_setup(checkout)[1]
+
+
 # ------------------------------------------------ MuJoCo's OpenGL
 
 
 @pytest.fixture
-def setup_mujoco(setup_vulkan, monkeypatch):
-    """The script as a module; apt and root are not touched."""
+def setup_mujoco(setup_vulkan, monkeypatch, tmp_path):
+    """The script as a module; apt, root and this checkout's folder are not touched."""
     spec = importlib.util.spec_from_file_location("setup_mujoco", REPO / "scripts" / "setup_mujoco.py")
     module = importlib.util.module_from_spec(spec)
+    monkeypatch.setitem(sys.modules, "setup_mujoco", module)  # dataclasses look their module up
     spec.loader.exec_module(module)
     monkeypatch.setattr(module, "run", lambda command: "")
     monkeypatch.setattr(module, "Apt", lambda: SimpleNamespace(update=lambda: None))
     monkeypatch.setattr(module.shutil, "which", lambda name: f"/usr/bin/{name}")
+    monkeypatch.setattr(module, "PRIVATE", tmp_path / ".mujoco_gl")
     return module
 
 
 def answers(monkeypatch, module, *found):
-    """Let the trial renderings answer `found` one after the other; return what is installed in between."""
-    left, installed = list(found), []
-    monkeypatch.setattr(module, "renderer", lambda python: left.pop(0))
-    monkeypatch.setattr(module, "install", installed.append)
-    return installed
+    """Let the trial renderings answer `found` one after the other; return what is installed or unpacked in between."""
+    left, provided = list(found), []
+    monkeypatch.setattr(module, "renderer", lambda python, source: left.pop(0))
+    monkeypatch.setattr(module, "install", provided.append)
+
+    def unpack(packages, fresh, codename, choose):
+        provided.append(packages)
+        shutil.rmtree(fresh, ignore_errors=True)
+        (fresh / "root").mkdir(parents=True)
+        (fresh / "root" / packages[0]).touch()
+
+    monkeypatch.setattr(module, "unpack", unpack)
+    return provided
 
 
 def test_an_opengl_that_renders_is_kept(setup_mujoco, monkeypatch):
-    installed = answers(monkeypatch, setup_mujoco, ("a GPU through egl", ""))
+    provided = answers(monkeypatch, setup_mujoco, ("a GPU through egl", ""))
+    setup_mujoco.PRIVATE.mkdir()  # an earlier run's choice, from before the system had one
     assert setup_mujoco.ensure_renderer("python") == "a GPU through egl"
-    assert installed == []
+    assert provided == []
+    assert not setup_mujoco.PRIVATE.exists()
+
+
+def test_an_earlier_choice_that_renders_is_kept(setup_mujoco, monkeypatch):
+    provided = answers(monkeypatch, setup_mujoco, ("", "no EGL"), ("llvmpipe through egl", ""))
+    setup_mujoco.PRIVATE.mkdir()
+    (setup_mujoco.PRIVATE / setup_mujoco.MANIFEST).touch()
+    assert setup_mujoco.ensure_renderer("python") == "llvmpipe through egl"
+    assert provided == []
 
 
 def test_root_installs_egl_and_then_osmesa(setup_mujoco, monkeypatch):
     monkeypatch.setattr(setup_mujoco.os, "geteuid", lambda: 0)
-    installed = answers(monkeypatch, setup_mujoco, ("", "no EGL"), ("", "still none"), ("llvmpipe through osmesa", ""))
+    provided = answers(monkeypatch, setup_mujoco, ("", "no EGL"), ("", "still none"), ("llvmpipe through osmesa", ""))
     assert setup_mujoco.ensure_renderer("python") == "llvmpipe through osmesa"
-    assert installed == [setup_mujoco.EGL, setup_mujoco.OSMESA]
+    assert provided == [setup_mujoco.EGL.packages, setup_mujoco.OSMESA.packages]
 
 
-def test_without_root_it_says_what_to_ask_for_and_set_up_goes_on(setup_mujoco, monkeypatch, capsys):
+def test_without_root_the_first_that_renders_is_unpacked(setup_mujoco, monkeypatch):
     monkeypatch.setattr(setup_mujoco.os, "geteuid", lambda: 1000)
-    installed = answers(monkeypatch, setup_mujoco, ("", "no OpenGL to render with; and so on"))
+    provided = answers(monkeypatch, setup_mujoco, ("", "no EGL"), ("", "still none"), ("llvmpipe through osmesa", ""))
+    assert setup_mujoco.ensure_renderer("python") == "llvmpipe through osmesa"
+    assert provided == [setup_mujoco.EGL.packages, setup_mujoco.OSMESA.packages]
+    assert [path.name for path in (setup_mujoco.PRIVATE / "root").iterdir()] == ["libosmesa6"]
+    assert json.loads((setup_mujoco.PRIVATE / setup_mujoco.MANIFEST).read_text())["gl"] == "osmesa"
+    assert [path.name for path in setup_mujoco.PRIVATE.parent.iterdir()] == [".mujoco_gl"]
+
+
+@pytest.mark.parametrize("tools", [("apt-get", "dpkg-deb"), ("apt-get",), ()])
+def test_where_nothing_renders_it_says_what_to_ask_for_and_set_up_goes_on(setup_mujoco, monkeypatch, capsys, tools):
+    monkeypatch.setattr(setup_mujoco.os, "geteuid", lambda: 1000)
+    monkeypatch.setattr(setup_mujoco.shutil, "which", lambda name: name if name in tools else None)
+    provided = answers(monkeypatch, setup_mujoco, *[("", "no OpenGL to render with")] * 3)
     monkeypatch.setattr(sys, "argv", ["setup_mujoco.py", "python"])
     assert setup_mujoco.main() == 0
-    assert installed == []
+    assert len(provided) == (2 if len(tools) == 2 else 0)
+    assert not list(setup_mujoco.PRIVATE.parent.iterdir())
     told = capsys.readouterr().out
     assert "warning: Adroit and Meta-World will not render here: no OpenGL to render with: have libegl1" in told
+
+
+def test_the_trial_ignores_what_this_shell_names(setup_mujoco, monkeypatch, tmp_path):
+    (tmp_path / "python").write_text('#!/bin/sh\necho "$MUJOCO_GL,$LIBGL_DRIVERS_PATH,$MANICM_MS_MUJOCO_GL,$*"\n')
+    (tmp_path / "python").chmod(0o755)
+    monkeypatch.setenv("MUJOCO_GL", "glfw")
+    monkeypatch.setenv("LIBGL_DRIVERS_PATH", "/theirs")
+    asked = setup_mujoco.renderer(str(tmp_path / "python"), "system")
+    assert asked == (",,system,-m manicm_ms.envs.mujoco_render", "")
+
+
+def test_the_manifest_names_what_was_unpacked(setup_mujoco, monkeypatch, tmp_path):
+    """`outer` stands for EGL, `inner` for what it needs there; libGL was not fetched, so it is the system's."""
+    monkeypatch.undo()
+    compiler = shutil.which("cc") or pytest.skip("no C compiler to build two libraries with")
+    libraries = tmp_path / "root" / "usr" / "lib" / "any-linux-gnu"
+    vendor = tmp_path / "root" / "usr" / "share" / "glvnd" / "egl_vendor.d" / "50_mesa.json"
+    for folder in (libraries / "dri", vendor.parent):
+        folder.mkdir(parents=True)
+    vendor.touch()
+    (libraries / "dri" / "swrast_dri.so").touch()
+    (tmp_path / "inner.c").write_text("int inner(void) { return 41; }\n")
+    (tmp_path / "outer.c").write_text("int inner(void); int outer(void) { return inner() + 1; }\n")
+    inner, outer = libraries / "libinner_probe.so.2", libraries / "libEGL.so.1"
+    for library, *sources in ((inner, tmp_path / "inner.c"), (outer, tmp_path / "outer.c", inner)):
+        build = [compiler, "-shared", "-fPIC", f"-Wl,-soname,{library.name}", "-o", library, *sources]
+        subprocess.run(build, check=True)
+    setup_mujoco.write_manifest(sys.executable, tmp_path, setup_mujoco.EGL)
+    at = "root/usr/lib/any-linux-gnu"
+    assert json.loads((tmp_path / setup_mujoco.MANIFEST).read_text()) == {
+        "gl": "egl",
+        "preload": [f"{at}/libinner_probe.so.2", f"{at}/libEGL.so.1"],
+        "environment": {
+            "__EGL_VENDOR_LIBRARY_FILENAMES": "root/usr/share/glvnd/egl_vendor.d/50_mesa.json",
+            "LIBGL_DRIVERS_PATH": f"{at}/dri",
+        },
+    }

@@ -102,7 +102,7 @@ def _fate(job: Job, fates: dict[str, str], started: float) -> str | None:
     return None
 
 
-def run_in_processes(plan: Plan, processes: int, report: Callable[[Sequence[Job]], None]) -> None:
+def run_in_processes(plan: Plan, processes: int, report: Callable[[Sequence[Job]], None]) -> list[str]:
     """Work the plan off in `processes` processes, each with a log in out/logs; return when all of them have ended.
 
     Args:
@@ -110,15 +110,16 @@ def run_in_processes(plan: Plan, processes: int, report: Callable[[Sequence[Job]
         processes: how many.
         report: called every second with the jobs that are done.
 
+    Returns:
+        a line for each process that ended before its work was done.
+
     Raises KeyboardInterrupt after the processes were told to save and stop.
     """
     context = multiprocessing.get_context("spawn")
     logs = plan.out / "logs"
     logs.mkdir(parents=True, exist_ok=True)
-    workers = [
-        context.Process(target=_worker, args=(plan.to_json(), str(logs / f"{os.getpid()}-{k}.log")), daemon=False)
-        for k in range(processes)
-    ]
+    files = [logs / f"{os.getpid()}-{k}.log" for k in range(processes)]
+    workers = [context.Process(target=_worker, args=(plan.to_json(), str(file)), daemon=False) for file in files]
     jobs = all_jobs(plan)
     for worker in workers:
         worker.start()
@@ -132,6 +133,11 @@ def run_in_processes(plan: Plan, processes: int, report: Callable[[Sequence[Job]
     except KeyboardInterrupt:
         _stop(workers)
         raise
+    return [
+        f"a process ended with exit code {worker.exitcode}, see {file}"
+        for worker, file in zip(workers, files, strict=True)
+        if worker.exitcode
+    ]
 
 
 def _stop(workers: Sequence[multiprocessing.process.BaseProcess]) -> None:
@@ -149,6 +155,9 @@ def _stop(workers: Sequence[multiprocessing.process.BaseProcess]) -> None:
 
 def _worker(plan_json: str, log: str) -> None:
     """What a process does."""
+    # A session of its own: Ctrl-C on the terminal reaches the parent alone, which passes it on once. A training saves
+    # at the first one and would be cut off by a second.
+    os.setsid()
     signal.signal(signal.SIGINT, signal.default_int_handler)
     _end_with_parent()
     with _console(Path(log)) as console, contextlib.suppress(KeyboardInterrupt):

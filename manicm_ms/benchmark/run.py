@@ -74,7 +74,8 @@ def benchmark(
 
                 run_on_ray(plan, ray, report)
             else:
-                run_in_processes(plan, processes, report)
+                for trouble in run_in_processes(plan, processes, report):
+                    progress.console.print(trouble, style="red", markup=False, highlight=False)
         report([job for job in jobs if job.is_done()])
     measure_decisions(plan)
     results = compile_table(plan, command)

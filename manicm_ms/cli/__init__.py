@@ -245,7 +245,7 @@ def benchmark_command(
     evaluation_episodes: int = 20,
     processes: int | None = None,
     num_envs: int = 2,
-    device: str = "cpu",
+    device: str = "auto",
     ray: str | None = None,
 ) -> int:
     """Run the grid task x method x seed and write the paper's main table; any number of these may run at once.
@@ -270,7 +270,7 @@ def benchmark_command(
         evaluation_episodes: episodes of each of those.
         processes: that work at once; by default one a core.
         num_envs: environments that play at once in each.
-        device: torch device of trainings and policies.
+        device: torch device of trainings and policies; auto takes an accelerator where there is one.
         ray: address of a Ray cluster to work on instead ("auto", "local"); needs the extra ray and shared folders.
     """
     from manicm_ms.benchmark.plan import Plan, parse_envs, parse_seeds, split_names

@@ -10,7 +10,7 @@ import pytest
 
 from manicm_ms.policies.checkpoint import read_manifest
 
-GRID = ("--envs", "toy/near,toy/far", "--methods", "simple_dp3,one_step,manicm", "--seeds", "0,1")
+GRID = ("--envs", "toy/near,toy/far", "--methods", "simple_dp3,one_step,manicm", "--seeds", "0")
 EVALUATED = (*GRID, "--evaluations", "5", "--evaluation-episodes", "2")
 
 
@@ -48,7 +48,7 @@ def test_every_cell_is_there_with_its_episodes_and_evaluations(whole):
         (e, m) for e in ("toy/near", "toy/far") for m in ("simple_dp3", "one_step", "manicm")
     }
     for cell in found["cells"]:
-        assert cell["n"] == 2 * 4, "two training seeds, four fresh seeds each"
+        assert cell["n"] == 4
         assert cell["successes"] == sum(sum(won) for won in cell["outcomes"].values())
         assert cell["nfe"] == (10 if cell["method"] == "simple_dp3" else 1)
         assert cell["latency_ms"]["n"] > 0
@@ -69,7 +69,7 @@ def test_the_same_seed_meets_every_method_and_no_demonstration(whole):
         fresh = [
             [e["seed"] for e in json.loads(path.read_text())["episodes"]] for path in sorted(folder.rglob("judge.json"))
         ]
-        assert len(fresh) == 2 * 3
+        assert len(fresh) == 3
         assert all(seeds == list(range(100_000, 100_004)) for seeds in fresh)
         assert json.loads((folder / "collect.json").read_text())["episodes"] == 3
 
@@ -87,9 +87,9 @@ def test_the_same_command_again_does_nothing_twice(whole, start_benchmark):
     assert {p: p.stat().st_mtime_ns for p in before} == before
 
 
-def test_a_larger_grid_goes_on_in_the_same_folder_and_other_settings_are_refused(whole, start_benchmark):
+def test_other_settings_in_the_same_folder_are_refused(whole, start_benchmark):
     out, _ = whole
-    code, output = finish(start_benchmark(out, *EVALUATED[:2], "--seeds", "0", *EVALUATED[6:], "--demos", "4"))
+    code, output = finish(start_benchmark(out, *EVALUATED, "--demos", "4"))
     assert code == 2
     assert "demos differ" in output
     assert "choose another --out" in " ".join(output.split())

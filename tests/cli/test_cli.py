@@ -18,8 +18,8 @@ from manicm_ms.training.log import read_log
 from manicm_ms.training.run_folder import training_folder
 
 COMMANDS = (
-    "list", "check", "collect", "inspect", "convert", "evaluate", "calibrate", "board", "cloud", "doctor", "train",
-    "distill",
+    "list", "check", "collect", "experts", "inspect", "convert", "evaluate", "benchmark", "calibrate", "board", "cloud",
+    "doctor", "train", "distill",
 )  # fmt: skip
 STEPS = 200
 TINY = f"--steps {STEPS} --warmup-steps 2 --batch-size 4 --down-dims 8 16 --points 8 --save-every 50 --log-every 1"
@@ -138,6 +138,19 @@ def test_unknown_command_in_a_real_process():
         ("distill --teacher T --data DATA --out OUT --preset=papr", "'papr': did you mean 'paper'?"),
         ("train dp33 --data DATA --out OUT", "unknown teacher policy 'dp33': did you mean 'dp3'?"),
         ("collect ur3e/slide-blok --out OUT", "'ur3e/slide-blok': did you mean 'ur3e/slide-block'?"),
+        ("collect button-press-v2", "unknown env id 'button-press-v2': it is called 'metaworld/button-press' here"),
+        ("collect metaworld/hamer", "did you mean 'metaworld/hammer'?"),
+        ("collect", "name one environment id, or --tag"),
+        ("collect ur3e/slide-block --tag ur3e", "name one environment id, or --tag"),
+        ("collect --tag benchmark3", "unknown tag 'benchmark3': did you mean 'benchmark31'?"),
+        ("collect --tag adroit --style dapg", "--style belongs to one environment"),
+        ("experts fetch adroit/dor", "unknown expert file 'adroit/dor': did you mean 'adroit/door'?"),
+        ("experts fetch --from OUT", "name a folder that holds door.npz"),
+        ("experts list --from OUT", "--from goes with 'experts fetch'"),
+        ("benchmark --envs AdroitHandPen-v1 --out OUT", "it is called 'adroit/pen' here"),
+        ("benchmark --methods simple_dp --out OUT", "unknown method 'simple_dp': did you mean 'simple_dp3'?"),
+        ("benchmark --preset papr --out OUT", "unknown teacher preset 'papr': did you mean 'paper'?"),
+        ("benchmark --seeds one --out OUT", "--seeds takes whole numbers separated by commas"),
         ("check ur3e/slide-blok", "'ur3e/slide-blok': did you mean 'ur3e/slide-block'?"),
         ("collect ur3e/slide-block --out OUT --extras img", "choose from image, depth, privileged_state"),
         (
@@ -149,7 +162,8 @@ def test_unknown_command_in_a_real_process():
         ("evaluate --env ur3e/slide-block", "name at least one checkpoint folder"),
     ],
 )
-def test_one_line_says_what_is_wrong(told, demos, tmp_path, line, hint):
+def test_one_line_says_what_is_wrong(told, demos, tmp_path, line, hint, monkeypatch):
+    monkeypatch.setenv("MANICM_MS_EXPERTS", str(tmp_path / "experts"))
     places = {"DATA": demos, "OUT": tmp_path / "out", "T": tmp_path / "teacher"}
     assert_one_line(told(*(places.get(word, word) for word in line.split())), hint)
     assert not (tmp_path / "out").exists()

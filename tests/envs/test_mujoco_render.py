@@ -158,6 +158,7 @@ def test_an_unknown_choice_lists_those_that_exist(monkeypatch):
 @pytest.mark.parametrize(("egl", "osmesa", "choice"), [(1, 1, "egl"), (0, 1, "osmesa"), (0, 0, "disabled")])
 def test_egl_comes_first_then_osmesa(monkeypatch, egl, osmesa, choice):
     monkeypatch.delenv("MUJOCO_GL", raising=False)
+    monkeypatch.setenv("MANICM_MS_MUJOCO_GL", "system")
     monkeypatch.setattr(mujoco_gl, "_egl_works", lambda: bool(egl))
     monkeypatch.setattr(mujoco_gl, "_library", lambda *names: "OSMesa" in names[0] and bool(osmesa))
     assert mujoco_gl.prepare() == choice
@@ -165,6 +166,7 @@ def test_egl_comes_first_then_osmesa(monkeypatch, egl, osmesa, choice):
 
 def test_a_named_library_that_is_missing_is_told(monkeypatch):
     monkeypatch.setenv("MUJOCO_GL", "osmesa")
+    monkeypatch.setenv("MANICM_MS_MUJOCO_GL", "system")
     monkeypatch.setattr(mujoco_gl, "_library", lambda *names: None)
     with pytest.raises(RenderDeviceError, match=r"MUJOCO_GL=osmesa, but libOSMesa\.so\.8 is not here"):
         mujoco_gl.prepare()
