@@ -101,8 +101,8 @@ def _counted(cell: Mapping[str, Any]) -> str:
     if not cell["n"]:
         return "-"
     crashed = f", {cell['crashed']} crashed" if cell["crashed"] else ""
-    seeds = "/".join(f"{100 * rate:.0f}" for rate in cell["by_seed"].values())
-    by_seed = f"; seeds {seeds}" if len(cell["by_seed"]) > 1 else ""
+    seeds = ", ".join(f"{100 * rate:.0f}" for rate in cell["by_seed"].values())
+    by_seed = f"; seeds {seeds} %" if len(cell["by_seed"]) > 1 else ""
     return f"{cell['successes']}/{cell['n']} ({_interval(cell['ci95'])}{by_seed}{crashed})"
 
 

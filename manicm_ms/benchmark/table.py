@@ -15,7 +15,7 @@ from manicm_ms.benchmark.plan import Plan
 from manicm_ms.envs.simulator import ENVS
 from manicm_ms.evaluation.latency import measure_latency
 from manicm_ms.evaluation.machine import machine
-from manicm_ms.evaluation.statistics import compare_paired, mean_of_highest, wilson_interval
+from manicm_ms.evaluation.statistics import compare_paired, mean_of_highest, mean_rate_interval, wilson_interval
 from manicm_ms.paths import write_json
 from manicm_ms.provenance import package_versions
 
@@ -54,7 +54,7 @@ def compile_table(plan: Plan, command: str) -> dict[str, Any]:
     return {
         "schema_version": SCHEMA_VERSION,
         "command": command,
-        "plan": plan.identity,
+        "plan": plan.identity | {"data": str(plan.data)},
         "env_ids": list(plan.env_ids),
         "seeds": list(plan.seeds),
         "fresh_seeds": [plan.fresh_seeds.start, plan.fresh_seeds.stop - 1],
@@ -171,13 +171,13 @@ def _order(cell: Mapping[str, Any]) -> int:
 def _of_tasks(cells: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
     """Return the mean over tasks, each counted once.
 
-    The interval is Wilson's of the pooled episodes: what the number of episodes leaves open. It does not hold the
-    choice of tasks, nor what another training would give, of which `sd_over_seeds` tells.
+    The interval is what the number of episodes leaves open. It does not hold the choice of tasks, nor what another
+    training would give, of which `sd_over_seeds` tells.
     """
     seeds = sorted({seed for c in cells for seed in c["by_seed"]})
     complete = [s for s in seeds if all(s in c["by_seed"] for c in cells)]
     by_seed = [float(np.mean([c["by_seed"][s] for c in cells])) for s in complete]
-    low, high = wilson_interval(sum(c["successes"] for c in cells), sum(c["n"] for c in cells))
+    low, high = mean_rate_interval([(c["successes"], c["n"]) for c in cells])
     highest = [c["mean_of_5_highest"] for c in cells]
     return {
         "tasks": len(cells),

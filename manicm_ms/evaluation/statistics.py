@@ -80,6 +80,29 @@ def wilson_interval(successes: int, n: int, confidence: float = CONFIDENCE) -> I
     return Interval(0.0 if successes == 0 else float(low), 1.0 if successes == n else float(high))
 
 
+def mean_rate_interval(counts: Sequence[tuple[int, int]], confidence: float = CONFIDENCE) -> Interval:
+    """Return the interval of the mean of K independent rates, each counted once, given (successes, n) of each.
+
+    With Wilson limits (l_k, u_k) of each rate p_k and their mean p, the limits are::
+
+        p - sqrt(sum_k (p_k - l_k)^2) / K        p + sqrt(sum_k (u_k - p_k)^2) / K
+
+    It tells what the number of episodes leaves open, not what another choice of the K tasks would. One rate alone gets
+    its Wilson interval.
+
+    Source: the "method of variance estimates recovery", G. Y. Zou and A. Donner, Statistics in Medicine 27 (2008)
+    1693-1702; Newcombe's square-and-add is its case of a difference.
+    """
+    if not counts:
+        raise ConfigError("a mean of rates needs at least one")
+    limits = [wilson_interval(k, n, confidence) for k, n in counts]
+    rates = [k / n for k, n in counts]
+    mean = sum(rates) / len(rates)
+    below = math.sqrt(sum((p - low) ** 2 for p, (low, _) in zip(rates, limits, strict=True))) / len(rates)
+    above = math.sqrt(sum((high - p) ** 2 for p, (_, high) in zip(rates, limits, strict=True))) / len(rates)
+    return Interval(mean - below, mean + above)
+
+
 def success_rate(successes: Sequence[bool] | np.ndarray) -> SuccessRate:
     """Return the rate of true entries with its 95 % interval; raise ConfigError where there are none."""
     outcomes = np.asarray(successes, dtype=bool)

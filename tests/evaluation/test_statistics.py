@@ -12,6 +12,7 @@ from manicm_ms.evaluation.statistics import (
     compare_paired,
     mcnemar_exact,
     mean_of_highest,
+    mean_rate_interval,
     paired_counts,
     paired_difference_interval,
     success_rate,
@@ -139,3 +140,21 @@ def test_mean_of_highest_is_biased_upward_and_the_rate_is_not():
     rates = rng.binomial(20, 0.5, size=(2000, 40)) / 20
     assert np.mean([mean_of_highest(r, 5) for r in rates.tolist()]) > 0.6
     assert rates.mean() == pytest.approx(0.5, abs=0.005)
+
+
+def test_the_interval_of_a_mean_of_rates_is_wilsons_for_one_and_holds_its_level_for_many():
+    assert mean_rate_interval([(7, 10)]) == pytest.approx(wilson_interval(7, 10))
+    with pytest.raises(ConfigError):
+        mean_rate_interval([])
+    rng = np.random.default_rng(0)
+    true, n = np.array([0.99, 0.9, 0.3, 0.05]), np.array([50, 20, 50, 20])
+    draws = rng.binomial(n, true, size=(4000, 4))
+    inside = [
+        low <= true.mean() <= high for low, high in (mean_rate_interval(list(zip(d, n, strict=True))) for d in draws)
+    ]
+    assert 0.93 < np.mean(inside) < 0.975
+
+
+def test_the_interval_of_a_mean_of_rates_narrows_with_more_tasks_of_the_same_kind():
+    one, four = mean_rate_interval([(25, 50)]), mean_rate_interval([(25, 50)] * 4)
+    assert four[1] - four[0] == pytest.approx((one[1] - one[0]) / 2)
