@@ -152,7 +152,7 @@ def test_the_interval_of_a_mean_of_rates_is_wilsons_for_one_and_holds_its_level_
     inside = [
         low <= true.mean() <= high for low, high in (mean_rate_interval(list(zip(d, n, strict=True))) for d in draws)
     ]
-    assert 0.93 < np.mean(inside) < 0.975
+    assert 0.94 < np.mean(inside) < 0.985  # a little wide near 0 and 1, as Wilson's own intervals are
 
 
 def test_the_interval_of_a_mean_of_rates_narrows_with_more_tasks_of_the_same_kind():
