@@ -16,7 +16,7 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, T
 
 from manicm_ms.camera_model import CameraModel, read_camera
 from manicm_ms.devices import resolve_device, torch_threads
-from manicm_ms.errors import ConfigError, OutputExistsError
+from manicm_ms.errors import ConfigError, OutputExistsError, SpecMismatchError
 from manicm_ms.evaluation.latency import Latency, measure_latency
 from manicm_ms.evaluation.machine import machine
 from manicm_ms.evaluation.records import EpisodeLog, claimed_folder
@@ -28,7 +28,7 @@ from manicm_ms.paths import sha256, write_json
 from manicm_ms.provenance import package_versions
 from manicm_ms.realism import REALISM, RealismSample, parse_presets
 from manicm_ms.seeds import require_seed
-from manicm_ms.types import AGENT_POS, ChunkSpec, EnvSpec, require_compatible
+from manicm_ms.types import AGENT_POS, DP3_FRAME, ChunkSpec, EnvSpec, require_compatible
 
 if TYPE_CHECKING:
     from manicm_ms.envs.vec_env import VecEnv
@@ -259,6 +259,10 @@ def load_contenders(checkpoints: Sequence[Path], device: str = "cpu", control: b
 
 def _require_made_for(spec: EnvSpec, contender: Contender) -> None:
     """Raise SpecMismatchError before anything is written where the environment cannot serve the policy."""
+    if contender.policy.spec.obs.frame == DP3_FRAME != spec.obs.frame:
+        raise SpecMismatchError(
+            f"checkpoint {contender.checkpoint} learnt from clouds of the observation preset dp3: add --obs-preset dp3"
+        )
     colors = contender.policy.spec.obs.point_channels  # the environment is made with or without, as the policy wants
     offered = replace(spec, obs=replace(spec.obs, point_channels=colors))
     require_compatible(

@@ -9,8 +9,17 @@ import pytest
 from point_mass import SPEC, PointMass, Proportional
 from rich.console import Console
 
-from manicm_ms.errors import ConfigError, OutputExistsError
-from manicm_ms.evaluation.judge import CONTROL, STUDENT, TEACHER, Contender, EnvMaker, Protocol, judge
+from manicm_ms.errors import ConfigError, OutputExistsError, SpecMismatchError
+from manicm_ms.evaluation.judge import (
+    CONTROL,
+    STUDENT,
+    TEACHER,
+    Contender,
+    EnvMaker,
+    Protocol,
+    _require_made_for,
+    judge,
+)
 from manicm_ms.evaluation.records import EpisodeLog
 from manicm_ms.evaluation.report import render_markdown
 from manicm_ms.evaluation.statistics import compare_paired, wilson_interval
@@ -216,3 +225,11 @@ def test_a_senseless_protocol_is_refused():
         Protocol(SPEC.env_id, (1,), num_envs=0)
     with pytest.raises(ConfigError, match="seed must not be negative, got -3"):
         Protocol(SPEC.env_id, (-3, -2), num_envs=1)
+
+
+def test_a_policy_of_the_dp3_preset_is_told_the_option_that_it_needs():
+    theirs = dataclasses.replace(SPEC, obs=dataclasses.replace(SPEC.obs, frame="dp3"))
+    contender = Contender("student", STUDENT, "runs/student", Proportional(spec=theirs))
+    with pytest.raises(SpecMismatchError, match="runs/student learnt from clouds .* add --obs-preset dp3"):
+        _require_made_for(SPEC, contender)
+    _require_made_for(theirs, contender)
