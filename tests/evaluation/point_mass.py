@@ -26,10 +26,12 @@ class PointMass(gym.vector.VectorEnv):
     """N points, each started at random by its seed; success is to come within REACH of the origin.
 
     `crash_at` maps a seed to the control step at which its simulation fails; `dies` holds seeds whose
-    presence kills the whole env at its first step; `spec` lets a test ask for another success rule.
+    presence kills the whole env at its first step; `spec` lets a test ask for another success rule; with `goes_on`
+    success ends nothing, as in Meta-World.
     """
 
-    def __init__(self, num_envs, chunk=CHUNK, *, spec=SPEC, crash_at=None, dies=()):
+    def __init__(self, num_envs, chunk=CHUNK, *, spec=SPEC, crash_at=None, dies=(), goes_on=False):
+        self.goes_on = goes_on
         self.num_envs, self.chunk, self.env_spec, self.device = num_envs, chunk, spec, torch.device("cpu")
         self.crash_at, self.dies = crash_at or {}, set(dies)
         self.seeds = [None] * num_envs
@@ -67,7 +69,7 @@ class PointMass(gym.vector.VectorEnv):
             for action in actions[i]:
                 if not self.finished[i]:
                     reward[i] += self._step_row(i, np.clip(action, -1, 1))
-        terminated = self.success | np.array([e is not None for e in self.error])
+        terminated = (self.success & (not self.goes_on)) | np.array([e is not None for e in self.error])
         truncated = self.steps >= self.env_spec.max_episode_steps
         return (
             self._obs(),
@@ -85,7 +87,8 @@ class PointMass(gym.vector.VectorEnv):
         self.success_once[i] |= self.success[i]
         if self.crash_at.get(self.seeds[i]) == self.steps[i]:
             self.error[i], self.success[i] = "solver diverged", False
-        self.finished[i] = self.success[i] or self.error[i] or self.steps[i] >= self.env_spec.max_episode_steps
+        solved = self.success[i] and not self.goes_on
+        self.finished[i] = solved or self.error[i] or self.steps[i] >= self.env_spec.max_episode_steps
         return -np.linalg.norm(self.pos[i])
 
     def render_video_frames(self):

@@ -237,3 +237,21 @@ def test_a_result_survives_json():
     assert back == result
     np.testing.assert_array_equal(back.actions, result.actions)
     assert back.crashed == "solver diverged"
+
+
+@pytest.mark.parametrize("num_envs", [1, 4])
+def test_an_episode_ends_with_the_chunk_that_makes_success_certain_though_the_env_goes_on(num_envs):
+    ending = rollout(PointMass(num_envs), Proportional(), SEEDS)
+    going_on = rollout(PointMass(num_envs, goes_on=True), Proportional(), SEEDS)
+    assert [e.success for e in going_on] == [e.success for e in ending]
+    assert any(e.success for e in ending)
+    for first, second in zip(ending, going_on, strict=True):
+        assert second.decisions == first.decisions
+        limit = min(second.decisions * CHUNK.n_action_steps, SPEC.max_episode_steps)
+        assert first.steps <= second.steps == limit
+
+
+def test_where_success_must_last_nothing_ends_early():
+    spec = dataclasses.replace(SPEC, success_rule="last")
+    results = rollout(PointMass(4, goes_on=True, spec=spec), Proportional(spec=spec), SEEDS)
+    assert {e.steps for e in results} == {SPEC.max_episode_steps}
