@@ -89,6 +89,7 @@ def _claim(plan: Plan) -> None:
     require_same_request(plan.out, plan.identity, PLAN_FILE, "benchmark")
     plan.out.mkdir(parents=True, exist_ok=True)
     write_json(plan.out / PLAN_FILE, plan.identity)
+    require_same_request(plan.out, plan.identity, PLAN_FILE, "benchmark")  # another one may have come in between
 
 
 def _show(results: dict[str, Any], out: Path, console: Console) -> None:

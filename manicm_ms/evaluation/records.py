@@ -59,8 +59,10 @@ def require_same_request(out: Path, request: Mapping[str, Any], file: str = RUN_
     if not out.is_dir():
         raise OutputExistsError(f"{out} is a file: choose a folder for --out")
     run_file = out / file
+    # Looked at before the file itself: another process may be writing it at this moment, and others only after it.
+    others = [p.name for p in out.iterdir() if p.name != _LOCK_FILE and not p.name.startswith(f".{file}.")]
     if not run_file.exists():
-        if any(path.name != _LOCK_FILE for path in out.iterdir()):
+        if others:
             raise OutputExistsError(f"{out} holds other files and no {file}: choose another --out")
         return
     try:
