@@ -102,6 +102,7 @@ class _Machine:
         self.memo: dict[int, Any] = {}
 
     def run(self, stream: BytesIO) -> Any:
+        """Return what the pickle that begins here describes; the stream then stands behind it."""
         with _malformed_is_told():
             for number, (opcode, value, _) in enumerate(pickletools.genops(stream)):
                 if number > _MOST_OPCODES:

@@ -163,26 +163,28 @@ def evaluate(
     if episodes < 1:
         raise ConfigError(f"--episodes must be at least 1, got {episodes}")
     rows = min(num_envs or default_num_envs(), episodes)
-    seeds = tuple(range(seed, seed + episodes))
-    protocol = Protocol(env_id, seeds, rows, threads, repetitions, videos, parse_presets(realism))
+    seeds, presets = tuple(range(seed, seed + episodes)), parse_presets(realism)
+    protocol = Protocol(env_id, seeds, rows, threads, repetitions, videos, presets)
     model = None if camera is None else read_camera(camera)
     entry = ENVS.get(env_id)
     backend = resolve_backend(backend, entry)
-    for preset in protocol.realism:
+    for preset in presets:
         entry.require(SimulatorConfig(realism=REALISM.get(preset), camera=model, obs_preset=obs_preset))
     contenders = load_contenders(checkpoints, device, control)
-    for contender in contenders:
-        _require_made_for(SimulatorConfig(obs_preset=obs_preset).specialise(entry.spec), contender)
-    request = _request(protocol, contenders, backend, device, model)
-    if obs_preset != OBS_PRESET:
-        request["obs_preset"] = obs_preset
+    _require_made_for(SimulatorConfig(obs_preset=obs_preset).specialise(entry.spec), contenders)
+    request = _request(protocol, contenders, backend, device, model, obs_preset)
     command = command or _command(checkpoints, env_id, episodes, seed, out, realism, camera, obs_preset)
     envs = env_maker(env_id, backend, model, obs_preset)
     return judge(contenders, protocol, envs, out, request, command, console or Console())
 
 
 def _request(
-    protocol: Protocol, contenders: Sequence[Contender], backend: str, device: str, camera: CameraModel | None
+    protocol: Protocol,
+    contenders: Sequence[Contender],
+    backend: str,
+    device: str,
+    camera: CameraModel | None,
+    obs_preset: str,
 ) -> dict[str, Any]:
     """Return what identifies an evaluation in its folder: an interrupted one goes on where all of it is the same."""
     return {
@@ -193,6 +195,7 @@ def _request(
         "device": device,
         "policies": [[c.name, c.role, checkpoint_digest(c.checkpoint)] for c in contenders],
         **_requested_realism(protocol.realism, camera),
+        **({} if obs_preset == OBS_PRESET else {"obs_preset": obs_preset}),
     }
 
 
@@ -257,17 +260,18 @@ def load_contenders(checkpoints: Sequence[Path], device: str = "cpu", control: b
     return contenders
 
 
-def _require_made_for(spec: EnvSpec, contender: Contender) -> None:
-    """Raise SpecMismatchError before anything is written where the environment cannot serve the policy."""
-    if contender.policy.spec.obs.frame == DP3_FRAME != spec.obs.frame:
-        raise SpecMismatchError(
-            f"checkpoint {contender.checkpoint} learnt from clouds of the observation preset dp3: add --obs-preset dp3"
-        )
-    colors = contender.policy.spec.obs.point_channels  # the environment is made with or without, as the policy wants
-    offered = replace(spec, obs=replace(spec.obs, point_channels=colors))
-    require_compatible(
-        offered, contender.policy.spec, f"environment {spec.env_id}", f"checkpoint {contender.checkpoint}"
-    )
+def _require_made_for(spec: EnvSpec, contenders: Sequence[Contender]) -> None:
+    """Raise SpecMismatchError before anything is written where the environment cannot serve one of the policies."""
+    for contender in contenders:
+        theirs = contender.policy.spec
+        if theirs.obs.frame == DP3_FRAME != spec.obs.frame:
+            raise SpecMismatchError(
+                f"checkpoint {contender.checkpoint} learnt from clouds of the observation preset dp3: "
+                "add --obs-preset dp3"
+            )
+        # The environment is made with or without colours, as the policy wants.
+        offered = replace(spec, obs=replace(spec.obs, point_channels=theirs.obs.point_channels))
+        require_compatible(offered, theirs, f"environment {spec.env_id}", f"checkpoint {contender.checkpoint}")
 
 
 def checkpoint_digest(folder: str) -> str:

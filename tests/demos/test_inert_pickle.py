@@ -152,10 +152,9 @@ def payloads(target):
 
 def test_a_malicious_pickle_is_described_and_does_nothing(tmp_path):
     target = tmp_path / "touched"
-    pickle.loads(next(payloads(target)))
-    assert target.exists(), "loaded, it would have done it"
-    target.unlink()
     for content in payloads(target):
+        calls = {opcode.name for opcode, _, _ in pickletools.genops(content)} & {"REDUCE", "OBJ", "INST"}
+        assert calls, "loaded, it would call something"
         described = inert_pickle.describe(content)
         inert_pickle.attributes(described), inert_pickle.entries(described)
         assert inert_pickle.tensor(described) is None
@@ -338,7 +337,7 @@ def legacy_bytes(**changes):
 
 def test_the_legacy_file_of_a_storage_by_its_own_description():
     storage = Call(Global("torch.storage", "_load_from_bytes"), (legacy_bytes(),))
-    assert torch.load(io.BytesIO(legacy_bytes()), weights_only=False).tolist() == [1, 2, 3], "PyTorch agrees"
+    assert torch.load(io.BytesIO(legacy_bytes()), weights_only=True).tolist() == [1, 2, 3], "PyTorch agrees"
     assert inert_pickle.tensor(rebuilt(storage, 0, (3,), (1,))).tolist() == [1, 2, 3]
 
 

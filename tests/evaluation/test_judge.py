@@ -231,5 +231,5 @@ def test_a_policy_of_the_dp3_preset_is_told_the_option_that_it_needs():
     theirs = dataclasses.replace(SPEC, obs=dataclasses.replace(SPEC.obs, frame="dp3"))
     contender = Contender("student", STUDENT, "runs/student", Proportional(spec=theirs))
     with pytest.raises(SpecMismatchError, match=r"runs/student learnt from clouds .* add --obs-preset dp3"):
-        _require_made_for(SPEC, contender)
-    _require_made_for(theirs, contender)
+        _require_made_for(SPEC, [contender])
+    _require_made_for(theirs, [contender])
