@@ -159,22 +159,21 @@ def evaluate(
     from manicm_ms.envs.simulator import ENVS, SimulatorConfig
     from manicm_ms.envs.vec_env import default_num_envs, resolve_backend
 
-    device = str(resolve_device(device))
     if episodes < 1:
         raise ConfigError(f"--episodes must be at least 1, got {episodes}")
-    rows = min(num_envs or default_num_envs(), episodes)
     seeds, presets = tuple(range(seed, seed + episodes)), parse_presets(realism)
+    rows = min(num_envs or default_num_envs(), episodes)
     protocol = Protocol(env_id, seeds, rows, threads, repetitions, videos, presets)
     model = None if camera is None else read_camera(camera)
     entry = ENVS.get(env_id)
     backend = resolve_backend(backend, entry)
     for preset in presets:
         entry.require(SimulatorConfig(realism=REALISM.get(preset), camera=model, obs_preset=obs_preset))
-    contenders = load_contenders(checkpoints, device, control)
+    contenders = load_contenders(checkpoints, device := str(resolve_device(device)), control)
     _require_made_for(SimulatorConfig(obs_preset=obs_preset).specialise(entry.spec), contenders)
     request = _request(protocol, contenders, backend, device, model, obs_preset)
-    command = command or _command(checkpoints, env_id, episodes, seed, out, realism, camera, obs_preset)
     envs = env_maker(env_id, backend, model, obs_preset)
+    command = command or _command(checkpoints, env_id, episodes, seed, out, realism, camera, obs_preset)
     return judge(contenders, protocol, envs, out, request, command, console or Console())
 
 
