@@ -161,6 +161,17 @@ def take_lock(path: Path, refuse: Callable[[str], ManicmError]) -> int:
 
 
 @contextmanager
+def waiting_lock(path: Path) -> Iterator[None]:
+    """Hold the lock file `path` within the block, after waiting for whoever has it; for work of moments."""
+    handle = os.open(path, os.O_RDWR | os.O_CREAT, 0o644)
+    try:
+        fcntl.flock(handle, fcntl.LOCK_EX)
+        yield
+    finally:
+        os.close(handle)
+
+
+@contextmanager
 def exclusive_lock(path: Path, refuse: Callable[[str], ManicmError]) -> Iterator[None]:
     """Hold the lock file `path` within the block; see `take_lock`."""
     handle = take_lock(path, refuse)

@@ -76,6 +76,11 @@ class Job(ABC):
         return self.stem.with_suffix(".failed.json")
 
     @property
+    def begun_file(self) -> Path:
+        """Exists while a process works on it, and after one died at it: how many have begun since an orderly end."""
+        return self.stem.with_suffix(".begun.json")
+
+    @property
     def lock_file(self) -> Path:
         """Locked by the process that works on it."""
         return self.stem.with_suffix(".lock")
@@ -127,12 +132,9 @@ class CollectJob(Job):
             self.env_id, plan.demos, path, num_envs=plan.num_envs, seed=plan.demo_seed, colors=plan.colors,
             obs_preset=plan.obs_preset, console=console,
         )  # fmt: skip
-        if done.episodes != plan.demos:
-            raise ConfigError(
-                f"{path} holds {done.episodes} demonstrations and {plan.demos} are to be learnt from: "
-                "name another --data"
-            )
         with DemoStore.open(path) as store:
+            _require_demos(store, plan)
+            plan.require_unseen(store.seeds.tolist())
             return {"attempts": done.attempts, "episodes": done.episodes, "mean_length": float(store.lengths.mean())}
 
 
@@ -159,6 +161,8 @@ class TrainJob(Job):
     def work(self, console: Console) -> dict[str, Any]:
         """See `Job.work`."""
         plan, source = self.plan, self.method.made_from
+        with DemoStore.open(store_path(plan.data, self.env_id)) as store:
+            _require_demos(store, plan)  # again: another command may have extended it since
         checkpoint = plan.checkpoint(self.env_id, self.seed, self.method)
         training = Training(
             store_path(plan.data, self.env_id), plan.preset, self.seed, plan.device, plan.evaluations, console,
@@ -197,7 +201,7 @@ class JudgeJob(Job):
         policy = self.method.load(checkpoint, plan.device)
         envs = env_maker(self.env_id, "auto", obs_preset=plan.obs_preset)
         with closing(RestartableEnv(lambda: envs.for_policy(policy, plan.num_envs, CLEAN))) as env:
-            fresh = self._play("fresh", policy, plan.fresh_seeds, env, console)
+            fresh = self._play("fresh", checkpoint, policy, plan.fresh_seeds, env, console)
             evaluations = self._evaluate_snapshots(checkpoint, env, console)
         return {
             "nfe": policy.nfe,
@@ -223,27 +227,41 @@ class JudgeJob(Job):
         if len(folders) != self.plan.evaluations:
             raise ConfigError(
                 f"{checkpoint} kept {len(folders)} checkpoints on the way and {self.plan.evaluations} are to be "
-                "evaluated: it was trained otherwise; delete it and its .train folder, or choose another --out"
+                f"evaluated: delete the folder {self.stem.parent} and it is trained again, or choose another --out"
             )
         results = []
         for number, (step, folder) in enumerate(folders.items()):
             policy = self.method.load(folder, self.plan.device)
-            episodes = self._play(f"step{step:08d}", policy, self.plan.evaluation_seeds(number), env, console)
+            seeds = self.plan.evaluation_seeds(number)
+            episodes = self._play(f"step{step:08d}", folder, policy, seeds, env, console)
             won = sum(e.success for e in episodes)
             results.append({"step": step, "n": len(episodes), "successes": won})
         return results
 
     def _play(
-        self, title: str, policy: Any, seeds: Sequence[int], env: RestartableEnv, console: Console
+        self, title: str, checkpoint: Path, policy: Any, seeds: Sequence[int], env: RestartableEnv, console: Console
     ) -> list[EpisodeResult]:
-        """Play the seeds that are not on disk yet; return all results in their order."""
-        with EpisodeLog(self.stem.parent / "episodes" / f"{title}.jsonl") as log:
+        """Play the seeds that are not on disk yet; return all results in their order.
+
+        What is on disk counts for these very weights only: its file is named after them.
+        """
+        weights = checkpoint_digest(str(checkpoint))[:12]
+        with EpisodeLog(self.stem.parent / "episodes" / f"{title}-{weights}.jsonl") as log:
             missing = [s for s in seeds if s not in log]
             with torch_threads(1):
                 rollout(env, policy, missing, on_episode=log.append)
             results = [log[s] for s in seeds]
         console.print(f"{self.name} {title}: {sum(e.success for e in results)} of {len(results)}", highlight=False)
         return results
+
+
+def _require_demos(store: DemoStore, plan: Plan) -> None:
+    """Raise ConfigError unless the store holds exactly the demonstrations that are to be learnt from."""
+    if len(store) != plan.demos:
+        raise ConfigError(
+            f"{store.path} holds {len(store)} demonstrations and {plan.demos} are to be learnt from: "
+            "name another --data"
+        )
 
 
 def all_jobs(plan: Plan) -> tuple[Job, ...]:

@@ -45,10 +45,16 @@ class Method(ABC):
     """A way to a policy.
 
     Attributes:
-        name: as on the command line, and of its folder.
+        name: as on the command line.
     """
 
     name: str
+
+    @property
+    def folder(self) -> str:
+        """Name of its folder: with its teacher's, so that the students of two teachers never take one another's."""
+        kind = self.name.partition(":")[0]
+        return kind if self.made_from is None else f"{kind}-{self.made_from.name}"
 
     @property
     def made_from(self) -> Method | None:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import re
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -16,6 +15,8 @@ from manicm_ms.training.presets import STUDENT_PRESETS, TEACHER_PRESETS
 
 EVALUATION_SEEDS_BEYOND = 1_000_000
 """The evaluations during training play seeds this far beyond the first fresh one."""
+HIGHEST = 5
+"""Evaluations during training of which the paper reports the mean."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -69,9 +70,23 @@ class Plan:
             raise ConfigError(
                 "demos, episodes, evaluation_episodes and num_envs must be at least 1, evaluations at least 0"
             )
-        TEACHER_PRESETS.get(self.preset)
-        STUDENT_PRESETS.get(self.preset)
+        steps = [preset.steps for preset in (TEACHER_PRESETS.get(self.preset), STUDENT_PRESETS.get(self.preset))]
+        most = min((s for s in steps if s is not None), default=self.evaluations)
+        if self.evaluations and not HIGHEST <= self.evaluations <= most:
+            raise ConfigError(
+                f"evaluations must be 0, or from {HIGHEST} (of which the mean is taken) to {most} (steps of the preset "
+                f"{self.preset}), got {self.evaluations}"
+            )
         _ = self.parsed_methods
+
+    def require_unseen(self, demonstrated: Sequence[int]) -> None:
+        """Raise ConfigError where a seed that is to judge a policy is among those of its demonstrations."""
+        judging = {*self.fresh_seeds, *(s for k in range(self.evaluations) for s in self.evaluation_seeds(k))}
+        if shared := judging & set(demonstrated):
+            raise ConfigError(
+                f"seed {min(shared)} is that of a demonstration and would judge the policies as well: choose "
+                "--eval-seed and --demo-seed apart"
+            )
 
     @property
     def parsed_methods(self) -> tuple[Method, ...]:
@@ -90,7 +105,7 @@ class Plan:
 
     def folder(self, env_id: str, seed: int | None = None, method: Method | None = None) -> Path:
         """Return where what belongs to a task, one of its seeds, or one method with that seed lies."""
-        parts = [env_id, *([] if seed is None else [f"seed{seed}"]), *([] if method is None else [slug(method.name)])]
+        parts = [env_id, *([] if seed is None else [f"seed{seed}"]), *([] if method is None else [method.folder])]
         return self.out.joinpath(*parts)
 
     def checkpoint(self, env_id: str, seed: int, method: Method) -> Path:
@@ -120,11 +135,6 @@ class Plan:
         values: Mapping[str, Any] = json.loads(text)
         lists = {k: tuple(v) for k, v in values.items() if isinstance(v, list)}
         return cls(**{**values, **lists, "out": Path(values["out"]), "data": Path(values["data"])})
-
-
-def slug(name: str) -> str:
-    """Return a method's name as a folder's."""
-    return re.sub(r"[^\w-]+", "-", name).strip("-")
 
 
 def parse_envs(text: str) -> tuple[str, ...]:

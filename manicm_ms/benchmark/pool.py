@@ -7,6 +7,7 @@ had finished is on disk and another one goes on from there.
 from __future__ import annotations
 
 import contextlib
+import json
 import logging
 import multiprocessing
 import os
@@ -26,6 +27,7 @@ from manicm_ms.paths import exclusive_lock, write_json
 
 DONE, FAILED, BLOCKED, BUSY = "done", "failed", "blocked", "busy"
 _POLL_S = 1.0
+_MOST_TRIES = 3  # of a job whose process is killed or crashes
 _STOP_S = 30.0  # a training needs some seconds to finish its step and save
 
 
@@ -33,13 +35,14 @@ class _TakenError(ManicmError):
     """Another process works on the job."""
 
 
-def attempt(job: Job, console: Console, place: str | None = None) -> str:
+def attempt(job: Job, console: Console, place: str | None = None, started: float = 0.0) -> str:
     """Do a job whose needs are done, unless another process is at it.
 
     Args:
         job: the job.
         console: where progress goes.
         place: who does it, for the record; by default this machine and process.
+        started: time since which processes that died at the job are counted; a crash would take one after the other.
 
     Returns:
         `DONE`, `FAILED` (its failure file says why) or `BUSY`.
@@ -47,21 +50,48 @@ def attempt(job: Job, console: Console, place: str | None = None) -> str:
     job.stem.parent.mkdir(parents=True, exist_ok=True)
     try:
         with exclusive_lock(job.lock_file, lambda holder: _TakenError(holder)):
-            if not job.is_done():
-                console.print(f"{job.name}: begun", highlight=False)
-                job.complete(console, place or f"{socket.gethostname()}, process {os.getpid()}")
+            return _attempt_alone(job, console, place or f"{socket.gethostname()}, process {os.getpid()}", started)
     except _TakenError:
         return BUSY
-    except KeyboardInterrupt:
-        raise
+
+
+def _attempt_alone(job: Job, console: Console, place: str, started: float) -> str:
+    """Do a job that nobody else can be at."""
+    if job.is_done():
+        return DONE
+    tries = 1 + _deaths(job, started)
+    if tries > _MOST_TRIES:
+        job.begun_file.unlink()  # the next run tries again
+        return _fail(job, console, f"{tries - 1} processes in a row died at it")
+    write_json(job.begun_file, {"tries": tries, "place": place})
+    console.print(f"{job.name}: begun", highlight=False)
+    try:
+        job.complete(console, place)
     except Exception as error:  # one job's trouble, of whatever kind, must not cost the others
-        reason = str(error) if isinstance(error, ManicmError) else f"{type(error).__name__}: {error}"
         if not isinstance(error, ManicmError):
             console.print_exception()
-        console.print(f"{job.name}: {reason}", style="red", markup=False, highlight=False)
-        write_json(job.failure_file, {"job": job.name, "reason": reason, "pid": os.getpid()})
-        return FAILED
-    return DONE
+        fate = _fail(job, console, str(error) if isinstance(error, ManicmError) else f"{type(error).__name__}: {error}")
+    else:
+        fate = DONE
+    finally:
+        job.begun_file.unlink(missing_ok=True)
+    return fate
+
+
+def _deaths(job: Job, started: float) -> int:
+    """Return how many processes have died at a job, one after the other, since a time."""
+    try:
+        if job.begun_file.stat().st_mtime < started:
+            return 0
+        return int(json.loads(job.begun_file.read_text(encoding="utf-8"))["tries"])
+    except FileNotFoundError:
+        return 0
+
+
+def _fail(job: Job, console: Console, reason: str) -> str:
+    console.print(f"{job.name}: {reason}", style="red", markup=False, highlight=False)
+    write_json(job.failure_file, {"job": job.name, "reason": reason, "pid": os.getpid()})
+    return FAILED
 
 
 def work_off(plan: Plan, console: Console) -> dict[str, str]:
@@ -81,7 +111,10 @@ def work_off(plan: Plan, console: Console) -> dict[str, str]:
             fate = _fate(job, fates, started)
             if fate is not None:
                 fates[job.name], progressed = fate, True
-            elif all(fates.get(need.name) == DONE for need in job.needs) and (tried := attempt(job, console)) != BUSY:
+            elif (
+                all(fates.get(need.name) == DONE for need in job.needs)
+                and (tried := attempt(job, console, started=started)) != BUSY
+            ):
                 fates[job.name], progressed = tried, True
                 break  # from the beginning: others may have got something done meanwhile
         if not progressed:

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import socket
 import sys
+import time
 from collections.abc import Callable, Sequence
 from typing import Any
 
@@ -43,17 +44,17 @@ def run_on_ray(plan: Plan, address: str, report: Callable[[Sequence[Job]], None]
             ray.init(address=address, log_to_driver=False, include_dashboard=False if address == "local" else None)
         except (ConnectionError, ValueError, RuntimeError) as error:
             raise _no_cluster(address, str(error).splitlines()[0]) from error
-    jobs, text = all_jobs(plan), plan.to_json()
+    jobs, text, started = all_jobs(plan), plan.to_json(), time.time()
     remote = ray.remote(num_cpus=1, max_retries=_RETRIES)(_job_on_a_node)
     running: dict[str, Any] = {}
     for job in jobs:  # in an order in which needs come first
-        running[job.name] = remote.remote(text, job.name, *(running[need.name] for need in job.needs))
+        running[job.name] = remote.remote(text, job.name, started, *(running[need.name] for need in job.needs))
     waiting = list(running.values())
     try:
         while waiting:
             _, waiting = ray.wait(waiting, num_returns=len(waiting), timeout=_POLL_S, fetch_local=False)
             report([job for job in jobs if job.is_done()])
-        return {name: _fate(ray, reference) for name, reference in running.items()}
+        return {job.name: _fate(ray, job, running[job.name]) for job in jobs}
     except KeyboardInterrupt:
         for reference in waiting:
             ray.cancel(reference)
@@ -77,14 +78,17 @@ def _no_cluster(address: str, reason: str) -> BackendError:
     )
 
 
-def _fate(ray: Any, reference: Any) -> str:
+def _fate(ray: Any, job: Job, reference: Any) -> str:
+    """Return what became of a job, and write down why where Ray itself could not have it done."""
     try:
         return str(ray.get(reference))
-    except ray.exceptions.RayError:  # the node died more often than a job is tried again
+    except ray.exceptions.RayError as error:  # its node went away too often, or could not start it at all
+        lines = str(error).strip().splitlines() or [type(error).__name__]
+        write_json(job.failure_file, {"job": job.name, "reason": f"on Ray: {lines[-1].strip()}"})
         return FAILED
 
 
-def _job_on_a_node(plan_json: str, name: str, *fates_of_needs: str) -> str:
+def _job_on_a_node(plan_json: str, name: str, started: float, *fates_of_needs: str) -> str:
     """What a Ray task does."""
     plan = Plan.from_json(plan_json)
     job = next(job for job in all_jobs(plan) if job.name == name)
@@ -93,11 +97,8 @@ def _job_on_a_node(plan_json: str, name: str, *fates_of_needs: str) -> str:
     if any(fate != DONE for fate in fates_of_needs):
         return BLOCKED
     node = f"Ray node {_ray().get_runtime_context().get_node_id()}"
-    fate = attempt(job, Console(file=sys.stderr, width=120), node)
-    if fate == BUSY:
-        reason = f"a process outside of this run works on it ({socket.gethostname()})"
-        write_json(job.failure_file, {"job": job.name, "reason": reason})
-        return FAILED
+    while (fate := attempt(job, Console(file=sys.stderr, width=120), node, started)) == BUSY:
+        time.sleep(_POLL_S)  # another command is at it: what it does counts here too
     return fate
 
 

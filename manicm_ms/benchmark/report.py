@@ -64,11 +64,19 @@ def _by_group(results: Mapping[str, Any], title: str, shown: Callable[[Mapping[s
     headers = ("method", "NFE", *(f"{name} ({tasks})" for name, tasks in groups.items()), "average", "one decision")
     lines = []
     for row in results["rows"]:
-        entries = [row["groups"].get(name) for name in groups]
-        cells = ["-" if entry is None else shown(entry) for entry in (*entries, row["average"])]
+        of = [*groups.values(), len(results["env_ids"])]
+        entries = [*(row["groups"].get(name) for name in groups), row["average"]]
+        cells = [_marked(entry, shown, tasks) for entry, tasks in zip(entries, of, strict=True)]
         time = "-" if row["decision_ms"] is None else format_ms(row["decision_ms"])
         lines.append((row["method"], "-" if row["nfe"] is None else str(row["nfe"]), *cells, time))
     return TextTable(title, headers, lines)
+
+
+def _marked(entry: Mapping[str, Any] | None, shown: Callable[[Mapping[str, Any]], str], tasks: int) -> str:
+    """Return a cell, which says so where it covers fewer tasks than its column: it is then no match for the others."""
+    if entry is None:
+        return "-"
+    return shown(entry) + (f" [{entry['tasks']} of {tasks} tasks]" if entry["tasks"] < tasks else "")
 
 
 def paper_table(results: Mapping[str, Any]) -> TextTable | None:
@@ -112,11 +120,13 @@ def paired_lines(results: Mapping[str, Any]) -> list[str]:
     for pair in results["paired"]:
         low, high = pair["difference_ci95"]
         n = pair["both"] + pair["only_first"] + pair["only_second"] + pair["neither"]
+        seeds = ", ".join(f"{100 * d:+.1f}" for d in pair["difference_by_seed"].values())
         lines.append(
-            f"{pair['second']} minus {pair['first']}, paired on the same {n} episodes of {pair['tasks']} tasks: "
-            f"{100 * pair['difference']:+.1f} points (95 % interval {100 * low:+.1f} to {100 * high:+.1f}; McNemar's "
-            f"exact test p = {pair['mcnemar_p']:.2g}; both {pair['both']}, only {pair['first']} {pair['only_first']}, "
-            f"only {pair['second']} {pair['only_second']}, neither {pair['neither']})."
+            f"{pair['second']} minus {pair['first']}, these trainings paired on the same {n} episodes of "
+            f"{pair['tasks']} tasks: {100 * pair['difference']:+.1f} points (by training seed {seeds}; 95 % interval "
+            f"{100 * low:+.1f} to {100 * high:+.1f}; McNemar's exact test p = {pair['mcnemar_p']:.2g}; both "
+            f"{pair['both']}, only {pair['first']} {pair['only_first']}, only {pair['second']} {pair['only_second']}, "
+            f"neither {pair['neither']})."
         )
     return lines
 

@@ -17,8 +17,8 @@ from manicm_ms.benchmark.table import compile_table, measure_decisions
 from manicm_ms.demos.experts import EXPERTS
 from manicm_ms.envs.simulator import ENVS, SimulatorConfig
 from manicm_ms.errors import ConfigError
-from manicm_ms.evaluation.records import require_same_request
-from manicm_ms.paths import write_json
+from manicm_ms.evaluation.records import LOCK_FILE, require_same_request
+from manicm_ms.paths import waiting_lock, write_json
 
 PLAN_FILE = "benchmark.json"
 
@@ -77,8 +77,9 @@ def benchmark(
                 for trouble in run_in_processes(plan, processes, report):
                     progress.console.print(trouble, style="red", markup=False, highlight=False)
         report([job for job in jobs if job.is_done()])
-    measure_decisions(plan)
-    results = compile_table(plan, command)
+    with waiting_lock(plan.out / LOCK_FILE):  # of several commands that end together, one measures while the rest waits
+        measure_decisions(plan, console)
+        results = compile_table(plan, command)
     write_benchmark(results, plan.out)
     _show(results, plan.out, console)
     return results
@@ -88,8 +89,9 @@ def _claim(plan: Plan) -> None:
     """Write down what results in `out` depend on, or raise OutputExistsError where they depend on something else."""
     require_same_request(plan.out, plan.identity, PLAN_FILE, "benchmark")
     plan.out.mkdir(parents=True, exist_ok=True)
-    write_json(plan.out / PLAN_FILE, plan.identity)
-    require_same_request(plan.out, plan.identity, PLAN_FILE, "benchmark")  # another one may have come in between
+    with waiting_lock(plan.out / LOCK_FILE):  # another command may begin at the same moment
+        require_same_request(plan.out, plan.identity, PLAN_FILE, "benchmark")
+        write_json(plan.out / PLAN_FILE, plan.identity)
 
 
 def _show(results: dict[str, Any], out: Path, console: Console) -> None:

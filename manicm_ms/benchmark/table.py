@@ -8,19 +8,19 @@ from itertools import groupby
 from typing import Any
 
 import numpy as np
+from rich.console import Console
 
 from manicm_ms.benchmark.jobs import CollectJob, JudgeJob, TrainJob
 from manicm_ms.benchmark.methods import Method
-from manicm_ms.benchmark.plan import Plan
+from manicm_ms.benchmark.plan import HIGHEST, Plan
 from manicm_ms.envs.simulator import ENVS
+from manicm_ms.errors import ManicmError
 from manicm_ms.evaluation.latency import measure_latency
 from manicm_ms.evaluation.machine import machine
 from manicm_ms.evaluation.statistics import compare_paired, mean_of_highest, mean_rate_interval, wilson_interval
 from manicm_ms.paths import write_json
 from manicm_ms.provenance import package_versions
 
-HIGHEST = 5
-"""Evaluations of which the paper reports the mean."""
 SCHEMA_VERSION = 1
 
 
@@ -29,20 +29,27 @@ def group_of(env_id: str) -> str:
     return ENVS.get(env_id).group or env_id.partition("/")[0]
 
 
-def measure_decisions(plan: Plan, repetitions: int = 30) -> None:
+def measure_decisions(plan: Plan, console: Console, repetitions: int = 30) -> None:
     """Time one decision of every method on each task's first seed, in turn, and keep it; call it on a quiet machine.
 
-    A task that is measured already, or lacks a method's checkpoint, is left out.
+    A task that is measured already, is not done, or lacks a checkpoint is left out.
     """
     for env_id in plan.env_ids:
         path = plan.folder(env_id) / "latency.json"
         jobs = [JudgeJob(plan, env_id, plan.seeds[0], method) for method in plan.parsed_methods]
-        if path.is_file() and set(json.loads(path.read_text())["methods"]) >= set(plan.methods):
+        wanted = {job.method.folder for job in jobs}
+        if path.is_file() and set(json.loads(path.read_text(encoding="utf-8"))["methods"]) >= wanted:
             continue
         if not all(job.is_done() for job in jobs):
             continue
-        checkpoints = {job.method: plan.checkpoint(env_id, job.seed, job.method) for job in jobs}
-        policies = {method.name: method.load(folder, plan.device) for method, folder in checkpoints.items()}
+        try:
+            policies = {
+                job.method.folder: job.method.load(plan.checkpoint(env_id, job.seed, job.method), plan.device)
+                for job in jobs
+            }
+        except ManicmError as error:
+            console.print(f"{env_id}: decisions not timed: {error}", style="yellow", markup=False, highlight=False)
+            continue
         measured = measure_latency(policies, repetitions=repetitions)
         times = {name: latency._asdict() for name, latency in measured.items()}
         write_json(path, {"machine": machine(), "methods": times})
@@ -75,7 +82,7 @@ def _judge_jobs(plan: Plan) -> Iterable[JudgeJob]:
 def _missing(job: JudgeJob) -> dict[str, str]:
     reason = "not done yet"
     for stage in (*_needs(job), job):
-        if stage.failure_file.is_file():
+        if stage.failure_file.is_file() and not stage.is_done():
             reason = json.loads(stage.failure_file.read_text(encoding="utf-8"))["reason"]
     return {"job": job.name, "reason": reason}
 
@@ -127,7 +134,7 @@ def _timed(plan: Plan, env_id: str, method: Method) -> dict[str, Any] | None:
     path = plan.folder(env_id) / "latency.json"
     if not path.is_file():
         return None
-    found: dict[str, Any] | None = json.loads(path.read_text(encoding="utf-8"))["methods"].get(method.name)
+    found: dict[str, Any] | None = json.loads(path.read_text(encoding="utf-8"))["methods"].get(method.folder)
     return found
 
 
@@ -199,6 +206,7 @@ def _paired(plan: Plan, cells: Sequence[Mapping[str, Any]]) -> list[dict[str, An
             continue
         first: list[bool] = []
         second: list[bool] = []
+        by_seed: dict[str, list[int]] = {}  # seed -> wins of the second over the first, one by one
         tasks = 0
         for env_id in plan.env_ids:
             ours, theirs = by_key[env_id, method.name], by_key[env_id, source.name]
@@ -207,8 +215,13 @@ def _paired(plan: Plan, cells: Sequence[Mapping[str, Any]]) -> list[dict[str, An
             for seed in both:
                 first += theirs[seed]
                 second += ours[seed]
+                by_seed.setdefault(seed, []).extend(
+                    int(b) - int(a) for a, b in zip(theirs[seed], ours[seed], strict=True)
+                )
         if first:
-            pairs.append({"first": source.name, "second": method.name, "tasks": tasks, **_pair(first, second)})
+            spread = {seed: float(np.mean(differences)) for seed, differences in by_seed.items()}
+            named = {"first": source.name, "second": method.name, "tasks": tasks}
+            pairs.append({**named, **_pair(first, second), "difference_by_seed": spread})
     return pairs
 
 

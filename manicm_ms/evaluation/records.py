@@ -15,7 +15,7 @@ from manicm_ms.paths import exclusive_lock, require_free_space, write_json
 
 RUN_FILE = "run.json"
 """What the folder holds: the request whose records lie in it."""
-_LOCK_FILE = ".lock"
+LOCK_FILE = ".lock"
 _NEED_BYTES = 50_000_000
 """Records, videos and report of a hundred episodes stay well below this."""
 
@@ -39,7 +39,7 @@ def claimed_folder(out: Path, request: Mapping[str, Any]) -> Iterator[Path]:
     def refuse(holder: str) -> OutputExistsError:
         return OutputExistsError(f"{out} is being written by process {holder}: wait for it or choose another --out")
 
-    with exclusive_lock(out / _LOCK_FILE, refuse):
+    with exclusive_lock(out / LOCK_FILE, refuse):
         require_same_request(out, request)
         write_json(out / RUN_FILE, dict(request))
         yield out
@@ -60,7 +60,7 @@ def require_same_request(out: Path, request: Mapping[str, Any], file: str = RUN_
         raise OutputExistsError(f"{out} is a file: choose a folder for --out")
     run_file = out / file
     # Looked at before the file itself: another process may be writing it at this moment, and others only after it.
-    others = [p.name for p in out.iterdir() if p.name != _LOCK_FILE and not p.name.startswith(f".{file}.")]
+    others = [p.name for p in out.iterdir() if p.name != LOCK_FILE and not p.name.startswith(f".{file}.")]
     if not run_file.exists():
         if others:
             raise OutputExistsError(f"{out} holds other files and no {file}: choose another --out")

@@ -65,6 +65,8 @@ def test_seeds_are_whole_numbers():
     [
         ({"episodes": 0}, "at least 1"),
         ({"evaluations": -1}, "at least 0"),
+        ({"evaluations": 4}, "from 5"),
+        ({"evaluations": 21}, "to 20 .steps of the preset smoke"),
         ({"seeds": (0, 0)}, "once"),
         ({"env_ids": ()}, "at least one task"),
         ({"eval_seed": -5}, "negative"),
@@ -98,7 +100,7 @@ def test_every_job_stands_after_those_it_needs_and_once():
     assert len(set(names)) == len(names) == 2 + 2 * 2 * (2 + 3), "collect per task; 2 trainings, 3 judged per seed"
     for k, job in enumerate(jobs):
         assert {need.name for need in job.needs} <= set(names[:k])
-    student = next(job for job in jobs if job.name == "adroit/door/seed1/manicm/train")
+    student = next(job for job in jobs if job.name == "adroit/door/seed1/manicm-simple_dp3/train")
     assert {need.name for need in student.needs} == {"adroit/door/collect", "adroit/door/seed1/simple_dp3/train"}
 
 
@@ -107,6 +109,22 @@ def test_a_student_alone_brings_its_teachers_training_but_not_its_judgement():
     assert names == {
         "adroit/door/collect",
         "adroit/door/seed0/simple_dp3/train",
-        "adroit/door/seed0/manicm/train",
-        "adroit/door/seed0/manicm/judge",
+        "adroit/door/seed0/manicm-simple_dp3/train",
+        "adroit/door/seed0/manicm-simple_dp3/judge",
     }
+
+
+def test_students_of_two_teachers_have_folders_of_their_own():
+    asked = plan(methods=("dp3", "simple_dp3", "manicm:dp3", "manicm:simple_dp3", "one_step:dp3"))
+    folders = [asked.folder("adroit/door", 0, method) for method in asked.parsed_methods]
+    assert len(set(folders)) == 5
+    alone = plan(methods=("simple_dp3", "manicm"))
+    assert alone.folder("adroit/door", 0, alone.parsed_methods[1]) == folders[3], "however it is called"
+
+
+def test_no_demonstration_judges_a_policy():
+    asked = plan(eval_seed=100, episodes=10, evaluations=5)
+    asked.require_unseen([0, 99, 110])
+    for seen in (100, 109, asked.evaluation_seeds(4)[-1]):
+        with pytest.raises(ConfigError, match=f"seed {seen} is that of a demonstration"):
+            asked.require_unseen([0, seen])

@@ -90,6 +90,8 @@ def test_pairs_meet_on_task_training_seed_and_fresh_seed(results):
     assert pair["both"] + pair["only_first"] == sum(sum(WINS[t, "simple_dp3"]) for t in ENVS)
     assert pair["both"] + pair["only_second"] == sum(sum(WINS[t, "manicm"]) for t in ENVS)
     assert "paired on the same 60 episodes of 3 tasks" in paired_lines(results)[0]
+    wins = {m: np.array([WINS[t, m] for t in ENVS]).sum(axis=0) / 30 for m in ("simple_dp3", "manicm")}
+    assert list(pair["difference_by_seed"].values()) == pytest.approx(list(wins["manicm"] - wins["simple_dp3"]))
 
 
 def test_a_cell_that_is_not_done_is_named_and_left_out(plan):
@@ -99,6 +101,7 @@ def test_a_cell_that_is_not_done_is_named_and_left_out(plan):
     assert {m["reason"] for m in results["missing"]} == {"not done yet"}
     assert row(results, "simple_dp3")["average"]["n"] == 10
     assert row(results, "manicm")["average"] is None
+    assert "[1 of 3 tasks]" in main_table(results).rows[0][-2], "no match for an average of all"
     assert results["paired"] == []
     write_benchmark(results, plan.out)  # of whatever is there
 
