@@ -192,8 +192,7 @@ class JudgeJob(Job):
     @property
     def needs(self) -> tuple[Job, ...]:
         """The checkpoint that it plays with."""
-        owner = self.method if self.method.trains or self.method.made_from is None else self.method.made_from
-        return (TrainJob(self.plan, self.env_id, self.seed, owner),)
+        return (TrainJob(self.plan, self.env_id, self.seed, self.method.owner),)
 
     def work(self, console: Console) -> dict[str, Any]:
         """See `Job.work`."""

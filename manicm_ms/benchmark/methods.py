@@ -66,6 +66,11 @@ class Method(ABC):
         """Whether it has a checkpoint of its own."""
         return True
 
+    @property
+    def owner(self) -> Method:
+        """The method whose checkpoint it plays with: itself, or what it is made from where it does not train."""
+        return self if self.trains or self.made_from is None else self.made_from
+
     @abstractmethod
     def train(self, out: Path, source: Path | None, training: Training) -> None:
         """Write the checkpoint `out`; `source` is that of `made_from`."""

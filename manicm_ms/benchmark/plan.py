@@ -110,8 +110,7 @@ class Plan:
 
     def checkpoint(self, env_id: str, seed: int, method: Method) -> Path:
         """Return the checkpoint folder that a method plays with: its own, or that of what it is made from."""
-        owner = method if method.trains or method.made_from is None else method.made_from
-        return self.folder(env_id, seed, owner) / "checkpoint"
+        return self.folder(env_id, seed, method.owner) / "checkpoint"
 
     @property
     def identity(self) -> dict[str, Any]:
