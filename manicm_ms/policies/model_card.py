@@ -8,6 +8,7 @@ from typing import Any
 from manicm_ms.policies.base import POLICIES, Policy
 
 LICENSE = "MIT"
+_LONG_LIST = 12  # numbers; longer lists are shown by their range
 
 _TITLES = {"teacher": "diffusion teacher", "student": "consistency student"}
 
@@ -63,5 +64,12 @@ def _bullets(values: Mapping[str, Any], indent: str = "") -> list[str]:
         if isinstance(value, Mapping):
             lines += [f"{indent}- {key}:", *_bullets(value, indent + "  ")]
         else:
-            lines.append(f"{indent}- {key}: {value}")
+            lines.append(f"{indent}- {key}: {_short(value)}")
     return lines or [f"{indent}- not recorded"]
+
+
+def _short(value: Any) -> Any:
+    """Return `value`, or the length and range of a long list of numbers, which the manifest holds in full."""
+    if not isinstance(value, list) or len(value) <= _LONG_LIST or not all(isinstance(v, int | float) for v in value):
+        return value
+    return f"{len(value)} numbers from {min(value)} to {max(value)}"

@@ -40,7 +40,8 @@ class Demos:
         spec: of the environment that they come from.
         windows: all of them, on the CPU.
         stats: ranges of `point_cloud`, `agent_pos` and `action`.
-        provenance: path, content hash, sizes, and the store's own provenance, JSON values.
+        provenance: path, content hash, sizes, `demo_seeds` (the seed of each episode, so that an evaluation can
+            tell what was seen), and the store's own provenance, JSON values.
     """
 
     spec: EnvSpec
@@ -64,6 +65,7 @@ def read_demos(path: Path, chunk: ChunkSpec) -> Demos:
             "frames": len(windows.action),
             "windows": len(windows),
             "sha256": digest.hexdigest(),
+            "demo_seeds": store.seeds.tolist(),
             "collection": store.provenance,
         }
         return Demos(store.spec, windows, stats, provenance)

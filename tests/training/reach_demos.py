@@ -47,10 +47,10 @@ def reach_episode(seed, spec, length=12):
     return Episode(*arrays, seed=seed, success=True)
 
 
-def make_store(path, episodes=6, **spec):
-    """Write a store of `episodes` reaching motions and return its path."""
+def make_store(path, episodes=6, first_seed=0, **spec):
+    """Write a store of `episodes` reaching motions, of the seeds from `first_seed` on, and return its path."""
     env_spec = reach_spec(**spec)
     with DemoStore.create(path, env_spec, {"expert": "straight"}) as store:
-        for seed in range(episodes):
+        for seed in range(first_seed, first_seed + episodes):
             store.append(reach_episode(seed, env_spec))
     return path

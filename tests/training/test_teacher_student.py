@@ -95,6 +95,18 @@ def test_checkpoint_says_where_it_comes_from(pair):
     assert taught["provenance"]["run"] == made["run"]
 
 
+def test_checkpoints_hold_the_seeds_of_their_demonstrations(pair, tmp_path):
+    _, _, teacher, student = pair
+    assert read_manifest(teacher)["provenance"]["data"]["demo_seeds"] == list(range(20))
+    assert read_manifest(student)["provenance"]["data"]["demo_seeds"] == list(range(20))
+    assert "demo_seeds: 20 numbers from 0 to 19" in (teacher / "MODEL_CARD.md").read_text()
+    other = make_store(tmp_path / "other.zarr", episodes=3, first_seed=70)
+    apart, _ = run(distill, teacher, other, tmp_path / "apart", replace(STUDENT, **FEW))
+    made = read_manifest(apart)["provenance"]
+    assert made["data"]["demo_seeds"] == [70, 71, 72]
+    assert made["teacher"]["provenance"]["data"]["demo_seeds"] == list(range(20))
+
+
 def test_finished_run_returns_at_once_and_leaves_no_state(pair):
     folder, data, teacher, student = pair
     before = {p: p.stat().st_mtime_ns for f in (teacher, student) for p in f.iterdir()}
