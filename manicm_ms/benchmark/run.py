@@ -7,7 +7,6 @@ from pathlib import Path
 from typing import Any
 
 from rich.console import Console
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
 
 from manicm_ms.benchmark.jobs import Job, all_jobs
 from manicm_ms.benchmark.plan import Plan
@@ -19,6 +18,7 @@ from manicm_ms.envs.simulator import ENVS, SimulatorConfig
 from manicm_ms.errors import ConfigError
 from manicm_ms.evaluation.records import LOCK_FILE, require_same_request
 from manicm_ms.paths import waiting_lock, write_json
+from manicm_ms.progress import progress_bars
 
 PLAN_FILE = "benchmark.json"
 
@@ -54,19 +54,16 @@ def benchmark(
         EXPERTS.get(env_id)
     _claim(plan)
     jobs = all_jobs(plan)
-    with Progress(
-        TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TextColumn("{task.fields[last]}"),
-        TimeElapsedColumn(), console=console,
-    ) as progress:  # fmt: skip
-        bar = progress.add_task("jobs", total=len(jobs), last="")
+    with progress_bars(console, "{task.fields[last]}") as shown:
+        bar = shown.add_task("jobs", total=len(jobs), last="")
         seen: set[str] = set()
 
         def report(done: Sequence[Job]) -> None:
             fresh = [job.name for job in done if job.name not in seen]
             seen.update(fresh)
-            progress.update(bar, completed=len(done))
+            shown.update(bar, completed=len(done))
             if fresh:
-                progress.update(bar, last=fresh[-1])
+                shown.update(bar, last=fresh[-1])
 
         if not all(job.is_done() for job in jobs):
             if ray is not None:
@@ -75,7 +72,7 @@ def benchmark(
                 run_on_ray(plan, ray, report)
             else:
                 for trouble in run_in_processes(plan, processes, report):
-                    progress.console.print(trouble, style="red", markup=False, highlight=False)
+                    shown.console.print(trouble, style="red", markup=False, highlight=False)
         report([job for job in jobs if job.is_done()])
     with waiting_lock(plan.out / LOCK_FILE):  # of several commands that end together, one measures while the rest waits
         measure_decisions(plan, console)

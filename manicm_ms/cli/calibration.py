@@ -9,6 +9,7 @@ from rich.console import Console
 from rich.table import Table
 
 from manicm_ms.calibration import Calibration
+from manicm_ms.progress import progress_bars
 
 _POOR_MM, _POOR_DEG = 3.0, 0.5  # standard errors above which more views are worth their while
 
@@ -16,9 +17,9 @@ _POOR_MM, _POOR_DEG = 3.0, 0.5  # standard errors above which more views are wor
 @contextmanager
 def progress() -> Iterator[Callable[[str], None]]:
     """Show the image that is being searched; yields what is to be called with its name."""
-    console = Console(stderr=True)
-    with console.status("calibrating") as status:
-        yield lambda name: status.update(f"{name}: looking for the board")
+    with progress_bars(Console(stderr=True), "{task.fields[image]}") as shown:
+        task = shown.add_task("looking for the board", total=None, image="")
+        yield lambda name: shown.update(task, advance=1, image=name)
 
 
 def report(solved: Calibration, console: Console) -> None:

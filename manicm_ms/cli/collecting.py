@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -17,6 +17,7 @@ from manicm_ms.demos.store import DemoStore, store_path
 from manicm_ms.envs.simulator import ENVS
 from manicm_ms.errors import ConfigError, ManicmError, UnknownNameError
 from manicm_ms.paths import is_disk_full
+from manicm_ms.progress import progress_bars
 
 DATA = Path("data")
 
@@ -74,7 +75,7 @@ def experts(action: str, names: tuple[str, ...], source: Path | None) -> None:
     """Fetch or list the expert files called `names`, all of them where there are none."""
     chosen = names or EXPERT_FILES.names()
     if action == "fetch":
-        fetch(chosen, source)
+        _fetch(chosen, source)
         return
     if source is not None:
         raise ConfigError("--from goes with 'experts fetch': drop it")
@@ -83,3 +84,14 @@ def experts(action: str, names: tuple[str, ...], source: Path | None) -> None:
         file = EXPERT_FILES.get(name)
         table.add_row(name, str(file.path) if file.path.is_file() else "not fetched", file.licence, file.url)
     console().print(table)
+
+
+def _fetch(names: Sequence[str], source: Path | None) -> None:
+    with progress_bars(console()) as shown:
+        bar = shown.add_task("fetch experts", total=len(names))
+
+        def report(line: str) -> None:
+            shown.console.print(line, markup=False, highlight=False, soft_wrap=True)
+            shown.advance(bar)
+
+        fetch(names, source, report)

@@ -19,7 +19,6 @@ from typing import Any
 import numpy as np
 import torch
 from rich.console import Console
-from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 
 from manicm_ms.camera_model import CameraModel, read_camera
 from manicm_ms.demos.experts import EXPERTS, Expert
@@ -28,6 +27,7 @@ from manicm_ms.envs.simulator import ENVS, DemoRule
 from manicm_ms.envs.vec_env import VecEnv, make_vec
 from manicm_ms.errors import ConfigError, ManicmError, StoreError
 from manicm_ms.paths import require_free_space
+from manicm_ms.progress import progress_bars
 from manicm_ms.provenance import package_versions
 from manicm_ms.realism import Realism, RealismSample, realism_name, resolve_realism
 from manicm_ms.seeds import require_seed
@@ -533,12 +533,11 @@ def _progress_bar(
     env_id: str, episodes: int, kept: int, console: Console | None = None
 ) -> Iterator[Callable[[int, int], None]]:
     """Show the episodes kept and how many were tried for them; yield what reports both numbers."""
-    columns = (TextColumn("[bold]{task.description}"), BarColumn(), TextColumn("{task.fields[note]}"))
-    with Progress(*columns, TimeElapsedColumn(), TimeRemainingColumn(), console=console) as progress:
-        bar = progress.add_task(f"collect {env_id}", total=episodes, completed=kept, note=f"{kept} of {episodes} kept")
+    with progress_bars(console or Console(), "kept{task.fields[tried]}") as shown:
+        bar = shown.add_task(f"collect {env_id}", total=episodes, completed=kept, tried="")
 
         def report(kept: int, attempts: int) -> None:
-            progress.update(bar, completed=kept, note=f"{kept} of {episodes} kept, {attempts} tried")
+            shown.update(bar, completed=kept, tried=f", {attempts} tried")
 
         yield report
 

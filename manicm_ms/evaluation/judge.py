@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 from rich.console import Console
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
+from rich.progress import Progress
 
 from manicm_ms.camera_model import CameraModel, read_camera
 from manicm_ms.devices import resolve_device, torch_threads
@@ -25,6 +25,7 @@ from manicm_ms.evaluation.rollout import EpisodeResult, RestartableEnv, rollout
 from manicm_ms.evaluation.statistics import compare_paired, success_rate
 from manicm_ms.evaluation.video import Take, choose_seeds, film
 from manicm_ms.paths import sha256, write_json
+from manicm_ms.progress import progress_bars
 from manicm_ms.provenance import package_versions
 from manicm_ms.realism import REALISM, RealismSample, parse_presets
 from manicm_ms.seeds import require_seed
@@ -492,7 +493,7 @@ def _play_policy(
             with torch_threads(protocol.threads):  # more fight the workers for the cores
                 rollout(home, contender.policy, missing, on_episode=_recorder(log, progress, bar))
         results = [log[s] for s in protocol.seeds]
-        progress.update(bar, successes=f"{sum(e.success for e in results)} successes")
+        progress.update(bar, successes=_successes(sum(e.success for e in results)))
     return results
 
 
@@ -509,7 +510,7 @@ def _recorder(log: EpisodeLog, progress: Progress, bar: Any) -> Callable[[Episod
         nonlocal successes
         log.append(result)
         successes += result.success
-        progress.update(bar, advance=1, successes=f"{successes} successes")
+        progress.update(bar, advance=1, successes=_successes(successes))
 
     return record
 
@@ -593,16 +594,12 @@ def _film(
     return [entry for entry in entries if (out / str(entry["file"])).exists()]
 
 
+def _successes(count: int) -> str:
+    return f"{count} success{'' if count == 1 else 'es'}"
+
+
 def _progress(console: Console) -> Progress:
-    return Progress(
-        TextColumn("{task.description}"),
-        BarColumn(),
-        MofNCompleteColumn(),
-        TextColumn("{task.fields[successes]}"),
-        TimeElapsedColumn(),
-        TimeRemainingColumn(),
-        console=console,
-    )
+    return progress_bars(console, "{task.fields[successes]}")
 
 
 def slug(name: str) -> str:

@@ -11,10 +11,11 @@ from types import TracebackType
 from typing import Any
 
 from rich.console import Console
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
+from rich.progress import Progress
 from torch.utils.tensorboard import SummaryWriter
 
 from manicm_ms.paths import write_text
+from manicm_ms.progress import progress_bars
 
 
 class RunLog:
@@ -75,14 +76,5 @@ class LossBar:
 @contextmanager
 def loss_bar(console: Console | None, title: str, total: int) -> Iterator[LossBar]:
     """Yield a progress bar on `console`, or one that shows nothing where that is None."""
-    columns = (
-        TextColumn("{task.description}"),
-        BarColumn(),
-        MofNCompleteColumn(),
-        TextColumn("loss {task.fields[loss]:.4g}"),
-        TimeElapsedColumn(),
-        TimeRemainingColumn(compact=True),
-        TextColumn("left"),
-    )
-    with Progress(*columns, console=console, disable=console is None) as progress:
-        yield LossBar(progress, title, total)
+    with progress_bars(console, "loss {task.fields[loss]:.4g}") as shown:
+        yield LossBar(shown, title, total)

@@ -191,6 +191,13 @@ def test_progress_shows_steps_and_loss(tmp_path):
     assert f"loss {last_loss:.4g}" in screen
 
 
+def test_in_a_file_the_last_step_and_loss_are_a_line(tmp_path):
+    with (tmp_path / "log").open("w") as f:
+        train(tmp_path / "run", console=Console(file=f))
+    last_loss = read_log(training_folder(tmp_path / "run") / "log.jsonl")[-1]["loss"]
+    assert f"  120/120  loss {last_loss:.4g}  " in (tmp_path / "log").read_text().splitlines()[-1]
+
+
 def test_tensorboard_has_the_logged_losses(uninterrupted):
     from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 

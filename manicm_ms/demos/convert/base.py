@@ -11,11 +11,11 @@ from pathlib import Path
 from typing import Any, Protocol
 
 import numpy as np
-from rich.progress import track
 
 from manicm_ms.demos.store import DemoStore, Episode
 from manicm_ms.errors import ManicmError, NoSpaceError, OutputExistsError, StoreError
 from manicm_ms.paths import is_disk_full, require_free_space, sync_tree, temporary_folder
+from manicm_ms.progress import progress_of
 from manicm_ms.registry import Registry
 
 _PACKAGE = "manicm_ms.demos.convert"
@@ -62,7 +62,7 @@ class Export:
         Raises StoreError where one cannot be read, or holds what only damage leaves.
         """
         numbers = range(len(self.store))
-        for k in track(numbers, f"convert {self.store.path.name}", total=len(numbers)):
+        for k in progress_of(numbers, f"convert {self.store.path.name}"):
             yield _sound(self.store, k)
 
     def about(self) -> dict[str, Any]:

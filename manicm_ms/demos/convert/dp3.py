@@ -14,7 +14,6 @@ from typing import Any
 
 import numpy as np
 import zarr
-from rich.progress import track
 
 from manicm_ms.demos.convert.base import IMPORTERS, Tally
 from manicm_ms.demos.store import DemoStore, Episode
@@ -22,6 +21,7 @@ from manicm_ms.envs.simulator import ENVS
 from manicm_ms.errors import ConfigError, SpecMismatchError, StoreError
 from manicm_ms.paths import require_free_space
 from manicm_ms.point_cloud import sample_cloud
+from manicm_ms.progress import progress_of
 from manicm_ms.provenance import package_versions
 from manicm_ms.types import ActionSpec, EnvSpec, ObsSpec, require_compatible
 
@@ -120,7 +120,7 @@ class _RawStore:
 
     def episodes(self) -> Iterator[tuple[int, int]]:
         starts = np.concatenate([[0], self.ends[:-1]])
-        yield from track(list(zip(starts.tolist(), self.ends.tolist(), strict=True)), f"convert {self.path.name}")
+        yield from progress_of(list(zip(starts.tolist(), self.ends.tolist(), strict=True)), f"convert {self.path.name}")
 
     def read(self, field: str, start: int, stop: int) -> np.ndarray:
         return _read(self.path, field, self.arrays[field], slice(start, stop))
