@@ -11,7 +11,7 @@ from typing import Any
 from manicm_ms.benchmark.methods import Method, parse_methods
 from manicm_ms.errors import ConfigError
 from manicm_ms.seeds import require_seed
-from manicm_ms.training.presets import STUDENT_PRESETS, TEACHER_PRESETS
+from manicm_ms.training.presets import STUDENT_PRESETS, TEACHER_PRESETS, preset_identity
 
 EVALUATION_SEEDS_BEYOND = 1_000_000
 """The evaluations during training play seeds this far beyond the first fresh one."""
@@ -121,7 +121,7 @@ class Plan:
         return {
             **{name: getattr(self, name) for name in named},
             "data": str(self.data.resolve()),
-            "recipes": {name: asdict(recipe) for name, recipe in recipes.items()},
+            "recipes": {name: preset_identity(recipe) for name, recipe in recipes.items()},
         }
 
     def to_json(self) -> str:

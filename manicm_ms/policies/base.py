@@ -78,6 +78,7 @@ class Policy(nn.Module, ABC):
                 on the policy's device; frames in order of time, the present one last.
             generator: source of the Gaussian noise; torch's default generator where it is None. Noise is
                 drawn on the generator's device and then moved, so a CPU generator gives every device the same.
+                It is the only source of chance: points that are drawn at random are a function of the noise.
             noise: what to use in place of drawn noise, (B, Tp, Da), or (noise_draws, B, Tp, Da).
 
         Returns:

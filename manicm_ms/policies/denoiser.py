@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Protocol
 
 import torch
@@ -12,6 +12,7 @@ from torch import Tensor, nn
 from manicm_ms.errors import ConfigError
 from manicm_ms.policies.encoders.point_net import DP3Encoder
 from manicm_ms.policies.normalizer import Normalizer
+from manicm_ms.policies.points import POINT_CHOICES
 from manicm_ms.policies.unet1d import UNet1D
 from manicm_ms.registry import Registry
 from manicm_ms.types import ACTION, AGENT_POS, POINT_CLOUD, ChunkSpec, EnvSpec
@@ -34,8 +35,11 @@ class NetworkConfig:
         cloud_frame: name in `CLOUD_FRAMES`: "base" (the environment's frame, min-max normalised) or "tcp"
             (relative to the tool centre point, which generalises far better from few demonstrations).
         cloud_scale: metres that become 1 in the "tcp" frame: about the reach of what matters around a gripper.
-        max_points: only the first so many points of a cloud are read, all where None. Clouds come in
-            farthest-point order, so that a prefix is itself a sampled cloud.
+        max_points: so many points of a cloud are read, all where None.
+        acting_points: which ones when acting, a name in `POINT_CHOICES`: "prefix" or "random". Checkpoints older than
+            this field act on the prefix.
+        training_points: which ones in training, so that a student learns from points like its teacher's. Checkpoints
+            older than this field were trained on random ones.
     """
 
     down_dims: tuple[int, ...] = (512, 1024, 2048)
@@ -50,9 +54,13 @@ class NetworkConfig:
     cloud_frame: str = "base"
     cloud_scale: float = 0.15
     max_points: int | None = None
+    acting_points: str = "prefix"
+    training_points: str = "random"
 
     def __post_init__(self) -> None:
         CLOUD_FRAMES.get(self.cloud_frame)
+        POINT_CHOICES.get(self.acting_points)
+        POINT_CHOICES.get(self.training_points)
         if self.kernel_size % 2 == 0:
             raise ConfigError(f"kernel_size must be odd, got {self.kernel_size}")
         if self.step_embed_dim % 2 or self.step_embed_dim < 4:
@@ -166,7 +174,7 @@ class ConditionedDenoiser(nn.Module):
         return self.encoder.out_features
 
     def encode(self, obs: Mapping[str, Tensor]) -> Tensor:
-        """Return the features of raw observations.
+        """Return the features of raw observations, of which the first `max_points` points are read.
 
         Args:
             obs: `point_cloud` (B, To, P, C) and `agent_pos` (B, To, D), in the environment's units and frame.
@@ -177,6 +185,22 @@ class ConditionedDenoiser(nn.Module):
         cloud = obs[POINT_CLOUD][:, :, : self.config.max_points]
         points = self.cloud_frame(cloud, obs[AGENT_POS], self.normalizer)
         return self.encoder(points, self.normalizer.normalize(AGENT_POS, obs[AGENT_POS]))
+
+    def encode_acting(self, obs: Mapping[str, Tensor], noise: Tensor) -> Tensor:
+        """Return the features (B, cond_dim) of what is read when acting: the points that `acting_points` chooses.
+
+        Args:
+            obs: as for `encode`.
+            noise: (B, Tp, Da) that the decision starts from; a random choice of points is a function of it.
+        """
+        cloud, count = obs[POINT_CLOUD], self.config.max_points
+        if count is not None and count < cloud.shape[2]:
+            cloud = POINT_CHOICES.get(self.config.acting_points).acting(cloud, count, noise)
+        return self.encode({POINT_CLOUD: cloud, AGENT_POS: obs[AGENT_POS]})
+
+    def act_on(self, points: str) -> None:
+        """Read other points when acting from now on, by a name in `POINT_CHOICES`; a checkpoint saved later says so."""
+        self.config = replace(self.config, acting_points=points)
 
     def denoise(self, x_t: Tensor, t: Tensor, cond: Tensor) -> Tensor:
         """Return the U-Net's output (B, Tp, Da) for x_t (B, Tp, Da) normalised, t (B,) and cond (B, cond_dim)."""

@@ -214,7 +214,7 @@ class DiffusionPolicy(Policy):
         """Choose the next actions; see `Policy.act`. `num_inference_steps` overrides the configured number."""
         batch = check_obs(obs, self.spec, self.chunk)
         (start,) = starting_noise(self, batch, generator, noise)
-        chunk = self.sample(self.network.encode(obs), start, num_inference_steps)
+        chunk = self.sample(self.network.encode_acting(obs, start), start, num_inference_steps)
         return executed_actions(self, chunk)
 
     def _sampler(self, steps: int) -> DDIMScheduler:
@@ -268,7 +268,7 @@ class OneStepTeacher(Policy):
         batch = check_obs(obs, self.spec, self.chunk)
         (start,) = starting_noise(self, batch, generator, noise)
         last = torch.full((batch,), self.teacher.diffusion.num_train_timesteps - 1, device=start.device)
-        return executed_actions(self, self.teacher.predict_x0(start, last, self.network.encode(obs)))
+        return executed_actions(self, self.teacher.predict_x0(start, last, self.network.encode_acting(obs, start)))
 
 
 class _HasNormalizer(Protocol):

@@ -173,7 +173,7 @@ class ManiCM(Policy):
         """Choose the next actions; see `Policy.act`."""
         batch = check_obs(obs, self.spec, self.chunk)
         draws = starting_noise(self, batch, generator, noise)
-        return executed_actions(self, self.sample(self.network.encode(obs), draws))
+        return executed_actions(self, self.sample(self.network.encode_acting(obs, draws[0]), draws))
 
     def _network_x0(self, x_t: Tensor, t: Tensor, cond: Tensor) -> Tensor:
         output = self.network.denoise(x_t, t, cond).float()

@@ -10,6 +10,7 @@ from torch import Tensor
 
 from manicm_ms.demos.windows import Windows
 from manicm_ms.policies.denoiser import ConditionedDenoiser
+from manicm_ms.policies.points import POINT_CHOICES
 from manicm_ms.training.stream import step_generator
 from manicm_ms.types import ACTION, POINT_CLOUD
 
@@ -43,20 +44,21 @@ class FeatureWindows:
         return {COND: self.cond[indices], CLEAN_ACTION: self.x0[indices]}
 
 
-def draw_points(batch: Mapping[str, Tensor], points: int | None, generator: torch.Generator) -> dict[str, Tensor]:
-    """Return the batch with `points` of its points, the same random ones in each cloud.
+def draw_points(
+    batch: Mapping[str, Tensor], points: int | None, generator: torch.Generator, choice: str = "random"
+) -> dict[str, Tensor]:
+    """Return the batch with `points` of its points, the same places in each cloud.
 
     Args:
         batch: `point_cloud` (B, To, P, C) and others, which stay.
         points: how many; None, or as many as there are, leaves the clouds as they are.
         generator: on the device of the batch.
+        choice: a name in `POINT_CHOICES`.
     """
     cloud = batch[POINT_CLOUD]
-    available = cloud.shape[2]
-    if points is None or points >= available:
+    if points is None or points >= cloud.shape[2]:
         return dict(batch)
-    chosen = torch.randperm(available, generator=generator, device=cloud.device)[:points]
-    return {**batch, POINT_CLOUD: cloud.index_select(2, chosen)}
+    return {**batch, POINT_CLOUD: POINT_CHOICES.get(choice).training(cloud, points, generator)}
 
 
 @torch.no_grad()
@@ -66,18 +68,20 @@ def encode_windows(network: ConditionedDenoiser, windows: Windows, draws: int, s
     Args:
         network: its encoder is frozen, its normaliser fitted; on the device of `windows`.
         windows: of demonstrations.
-        draws: K, point subsets for each window where the network reads fewer points than are stored: first
-            the prefix that it reads when acting, then random ones. Otherwise there is one.
+        draws: K, point subsets for each window where the network reads fewer points than are stored: first one
+            by its `acting_points`, then others by its `training_points`. There is one where no other can differ.
         seed: decides the subsets.
     """
     points, device = network.config.max_points, windows.action.device
-    if points is None or points >= windows.point_cloud.shape[1]:
-        draws = 1
+    choices = [network.config.acting_points, *[network.config.training_points] * (draws - 1)]
+    all_read = points is None or points >= windows.point_cloud.shape[1]
+    if all_read or not any(POINT_CHOICES.get(choice).varies for choice in choices):
+        choices = choices[:1]
     rows, actions = [], []
     for number, indices in enumerate(torch.arange(len(windows)).split(_BATCH)):
         batch = windows.batch(indices)
         generator = step_generator(seed, number, 0, device)
-        subsets = [batch, *(draw_points(batch, points, generator) for _ in range(draws - 1))]
+        subsets = [draw_points(batch, points, generator, choice) for choice in choices]
         rows.append(torch.stack([network.encode(subset) for subset in subsets], dim=1))  # (b, K, F)
         actions.append(network.normalizer.normalize(ACTION, batch[ACTION]))
     return FeatureWindows(torch.cat(rows), torch.cat(actions))

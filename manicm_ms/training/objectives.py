@@ -37,7 +37,7 @@ class DiffusionObjective(PolicyObjective):
 
     Args:
         policy: trained in place, its normaliser fitted.
-        points: points drawn at random from each cloud in each step; None for all.
+        points: points taken of each cloud in each step, as the network's `training_points` says; None for all.
         decay: of the averaged weights, which are the outcome.
     """
 
@@ -49,7 +49,7 @@ class DiffusionObjective(PolicyObjective):
     def forward(self, batch: Mapping[str, Tensor], generator: torch.Generator) -> Tensor:
         """Return the loss of raw windows: `point_cloud`, `agent_pos` and `action` as `Windows.batch` gives them."""
         policy, network = self.policy, self.policy.network
-        obs = draw_points(batch, self.points, generator)
+        obs = draw_points(batch, self.points, generator, network.config.training_points)
         x0 = network.normalizer.normalize(ACTION, batch[ACTION])  # (B, Tp, Da)
         epsilon = torch.randn(x0.shape, generator=generator, device=x0.device)
         last = policy.diffusion.num_train_timesteps

@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
+from typing import Any
 
 from manicm_ms.errors import ConfigError
+from manicm_ms.policies.points import POINT_CHOICES
 from manicm_ms.registry import Registry
 from manicm_ms.training.optim import FitConfig
 from manicm_ms.types import ChunkSpec
@@ -23,8 +25,10 @@ class TeacherPreset(FitConfig):
             tool centre point, in units of `cloud_scale`: 20 of 50 episodes more on Meta-World's pick-place. "auto" is
             tcp where agent_pos holds that point, else base (a hand without an arm's tool, as Adroit's).
         cloud_scale: metres that become 1 with `cloud_frame` "tcp"; unused with "base".
-        points: points drawn at random from each cloud in each step, and the length of the prefix read when acting
-            (clouds are stored in farthest-point order, so a prefix is a coarser cloud); None uses them all.
+        points: points read of each cloud, in training and when acting; None uses them all.
+        acting_points: which ones when acting: "prefix" (clouds are stored in farthest-point order, so a prefix is a
+            coarser cloud) or "random" (drawn anew for each decision, from its noise).
+        training_points: which ones in each step of training: "random" or "prefix".
         down_dims: channels of the U-Net's stages, or None for the policy's own.
         ema_power: of the averaged weights, which are the teacher in the end; see `PowerDecay`.
         ema_max_decay: never keep more than this of the old average.
@@ -38,6 +42,8 @@ class TeacherPreset(FitConfig):
     cloud_frame: str = "base"
     cloud_scale: float = 0.15
     points: int | None = None
+    acting_points: str = "prefix"
+    training_points: str = "random"
     down_dims: tuple[int, ...] | None = None
     ema_power: float = 0.75
     ema_max_decay: float = 0.9999
@@ -47,6 +53,8 @@ class TeacherPreset(FitConfig):
         super().__post_init__()
         if self.points is not None and self.points < 1:
             raise ConfigError(f"points must be at least 1 or None, got {self.points}")
+        POINT_CHOICES.get(self.acting_points)
+        POINT_CHOICES.get(self.training_points)
         if self.cloud_scale <= 0:
             raise ConfigError(f"cloud_scale must be positive (metres), got {self.cloud_scale}")
         _ = self.chunk  # checks the three lengths against each other
@@ -84,6 +92,20 @@ class StudentPreset(FitConfig):
             raise ConfigError(f"skip, draws and nfe must be at least 1, got {self.skip}, {self.draws}, {self.nfe}")
         if not 0 <= self.mu < 1:
             raise ConfigError(f"mu must lie in [0, 1), got {self.mu}")
+
+
+_ADDED_LATER = {"acting_points": "prefix", "training_points": "random"}
+"""Fields that presets got after runs were made with them, with what those runs did."""
+
+
+def preset_identity(preset: FitConfig) -> dict[str, Any]:
+    """Return the fields that tell one recipe from another, JSON values.
+
+    A field that was added later is left out where it says what was done before, so that older runs still are the same
+    run: they go on, or are found finished.
+    """
+    values = asdict(preset)
+    return {k: v for k, v in values.items() if not (k in _ADDED_LATER and v == _ADDED_LATER[k])}
 
 
 TEACHER_PRESETS: Registry[TeacherPreset] = Registry("teacher preset")

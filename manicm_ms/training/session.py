@@ -26,6 +26,7 @@ from manicm_ms.training.device import make_fabric, resolve_precision
 from manicm_ms.training.loop import Batches, FitResult, Snapshots, fit
 from manicm_ms.training.objectives import PolicyObjective
 from manicm_ms.training.optim import FitConfig
+from manicm_ms.training.presets import preset_identity
 from manicm_ms.training.run_folder import RunFolder, open_run, snapshot_folder, training_folder
 from manicm_ms.types import ChunkSpec, EnvSpec
 
@@ -141,7 +142,7 @@ class Session:
         identity = {
             "kind": self.kind,
             **inputs,
-            "preset": {k: v for k, v in asdict(self.preset).items() if k not in _NOT_IDENTITY},
+            "preset": {k: v for k, v in preset_identity(self.preset).items() if k not in _NOT_IDENTITY},
             "precision": self.precision,
             "seed": self.seed,
         }

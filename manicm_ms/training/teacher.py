@@ -92,6 +92,8 @@ def build_teacher(policy_name: str, demos: Demos, preset: TeacherPreset, seed: i
         "cloud_frame": _cloud_frame(preset, demos),
         "cloud_scale": preset.cloud_scale,
         "max_points": preset.points,
+        "acting_points": preset.acting_points,
+        "training_points": preset.training_points,
     }
     if preset.down_dims is not None:
         network["down_dims"] = preset.down_dims

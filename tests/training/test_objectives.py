@@ -39,9 +39,9 @@ def windows(store):
     return Windows.from_store(store, CHUNK)
 
 
-def small_policy(store, prediction_type="sample", max_points=None):
+def small_policy(store, prediction_type="sample", max_points=None, **network):
     config = {
-        "network": {"down_dims": (16, 32), "max_points": max_points, "cloud_frame": "tcp"},
+        "network": {"down_dims": (16, 32), "max_points": max_points, "cloud_frame": "tcp"} | network,
         "diffusion": {"prediction_type": prediction_type},
     }
     return make_policy("simple_dp3", store.spec, CHUNK, config, stats=store_stats(store), seed=0)
@@ -129,6 +129,27 @@ def test_first_cached_subset_is_what_the_policy_reads_when_acting(store, windows
     assert features.cond.shape[1] == 3
     torch.testing.assert_close(features.cond[:, 0], acting)
     assert not torch.allclose(features.cond[:, 1], features.cond[:, 2])
+
+
+@pytest.mark.parametrize(
+    ("acting", "training", "subsets", "prefixes"),
+    [("prefix", "random", 3, 1), ("random", "random", 3, 0), ("prefix", "prefix", 1, 1), ("random", "prefix", 3, 2)],
+)
+def test_cached_subsets_follow_the_two_choices_of_points(store, windows, acting, training, subsets, prefixes):
+    network = small_policy(store, max_points=16, acting_points=acting, training_points=training).network
+    features = encode_windows(network, windows, draws=3, seed=0).cond
+    prefix = network.encode(windows.batch(torch.arange(len(windows))))
+    assert features.shape[1] == subsets
+    assert sum(torch.allclose(features[:, k], prefix) for k in range(subsets)) == prefixes
+
+
+def test_diffusion_objective_reads_the_prefix_where_it_is_told_to(store, windows):
+    policy = small_policy(store, max_points=16, training_points="prefix")
+    batch = windows.batch(torch.arange(8))
+    spoiled = batch["point_cloud"].clone()
+    spoiled[:, :, 16:] = math.nan
+    objective = DiffusionObjective(policy, 16, PowerDecay())
+    assert torch.isfinite(objective(batch | {"point_cloud": spoiled}, generator()))
 
 
 class TimeTable(nn.Module):

@@ -5,7 +5,7 @@ from dataclasses import fields, replace
 import pytest
 
 from manicm_ms.errors import ConfigError, UnknownNameError
-from manicm_ms.training.presets import STUDENT_PRESETS, TEACHER_PRESETS, StudentPreset, TeacherPreset
+from manicm_ms.training.presets import STUDENT_PRESETS, TEACHER_PRESETS, StudentPreset, TeacherPreset, preset_identity
 
 
 def test_paper_student_is_the_paper_s():
@@ -26,6 +26,13 @@ def test_both_kinds_have_the_same_presets(registry):
     assert registry.names() == ("quick", "smoke", "paper")
     with pytest.raises(UnknownNameError, match="did you mean 'quick'"):
         registry.get("quik")
+
+
+def test_a_field_added_later_does_not_make_an_older_run_another_one():
+    quick = TEACHER_PRESETS.get("quick")
+    assert not {"acting_points", "training_points"} & set(preset_identity(quick))
+    assert preset_identity(replace(quick, acting_points="random"))["acting_points"] == "random"
+    assert preset_identity(quick)["points"] == 128
 
 
 @pytest.mark.parametrize("kind", [TeacherPreset, StudentPreset])
