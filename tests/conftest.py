@@ -1,5 +1,53 @@
-"""What holds for every test: MuJoCo's OpenGL is chosen before anything imports mujoco (ManiSkill's kinematics do)."""
+"""What holds for every test: one thread a process, MuJoCo's OpenGL, the order of the files, and who was at work."""
+
+import os
+import signal
+
+import pytest
+
+# Before torch is imported, here and in what the tests start: workers share the cores, and more threads fight over them.
+os.environ.setdefault("OMP_NUM_THREADS", "1")
 
 from manicm_ms import mujoco_gl
 
-mujoco_gl.prepare()
+mujoco_gl.prepare()  # before anything imports mujoco (ManiSkill's kinematics do)
+
+# Files that take longest, longest first: a worker gets whole files, and none should begin a long one at the end.
+LONGEST = ("benchmark/test_benchmark.py",)
+
+
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    """Put the long files first; the order within a file stays."""
+    items.sort(key=lambda item: next((k for k, name in enumerate(LONGEST) if name in item.nodeid), len(LONGEST)))
+
+
+class AtWork:
+    """Names the tests that had begun and not ended when the run was stopped, in whichever process they ran."""
+
+    def __init__(self) -> None:
+        self.begun: dict[str, None] = {}
+
+    def pytest_runtest_logstart(self, nodeid: str) -> None:
+        """Note a test that begins."""
+        self.begun[nodeid] = None
+
+    def pytest_runtest_logfinish(self, nodeid: str) -> None:
+        """Forget a test that has ended."""
+        self.begun.pop(nodeid, None)
+
+    def pytest_terminal_summary(self, terminalreporter: pytest.TerminalReporter) -> None:
+        """Say which tests are left."""
+        for nodeid in self.begun:
+            terminalreporter.write_line(f"did not end: {nodeid}", red=True)
+
+
+def pytest_configure(config: pytest.Config) -> None:
+    """Watch the tests from the process that tells of them; let it tell of them also where a time limit ends it."""
+    if not hasattr(config, "workerinput"):
+        config.pluginmanager.register(AtWork(), "at_work")
+        signal.signal(signal.SIGTERM, _stop)
+
+
+def _stop(number: int, frame: object) -> None:
+    signal.signal(number, signal.SIG_IGN)  # `timeout` sends it twice, and the second would cut off the telling
+    raise KeyboardInterrupt
