@@ -43,6 +43,13 @@ class ConfigError(ManicmError):
     """A configuration whose fields do not fit together or are out of range."""
 
 
+def require_at_least(least: int, **values: int) -> None:
+    """Raise ConfigError naming the first of `values` that is below `least`."""
+    for name, value in values.items():
+        if value < least:
+            raise ConfigError(f"{name} must be at least {least}, got {value}")
+
+
 class ActionError(ManicmError):
     """An action that has the wrong shape or is not finite."""
 

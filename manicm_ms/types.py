@@ -10,7 +10,7 @@ from collections.abc import Mapping
 from dataclasses import asdict, dataclass, field
 from typing import Any
 
-from manicm_ms.errors import ConfigError, SpecMismatchError
+from manicm_ms.errors import ConfigError, SpecMismatchError, require_at_least
 
 POINT_CLOUD = "point_cloud"
 """(P, 3) or (P, 6) float32: xyz in metres in `ObsSpec.frame`, then rgb in [0, 1]."""
@@ -58,8 +58,7 @@ class ChunkSpec:
     n_action_steps: int = 3
 
     def __post_init__(self) -> None:
-        if min(self.n_obs_steps, self.horizon, self.n_action_steps) < 1:
-            raise ConfigError(f"n_obs_steps, horizon and n_action_steps must be at least 1, got {self}")
+        require_at_least(1, n_obs_steps=self.n_obs_steps, horizon=self.horizon, n_action_steps=self.n_action_steps)
         most = self.horizon - self.n_obs_steps + 1
         if self.n_action_steps > most:
             raise ConfigError(

@@ -15,6 +15,7 @@ from typing import Annotated, Any, Literal
 
 import tyro
 
+from manicm_ms.cli.counts import AtLeast, Count, CountOrNone, OptionalCount, Seed, checked
 from manicm_ms.errors import ConfigError, ManicmError, UnknownNameError
 from manicm_ms.paths import is_disk_full
 
@@ -72,14 +73,14 @@ def collect_command(
     env_id: tyro.conf.Positional[str | None] = None,
     out: Path | None = None,
     tag: str | None = None,
-    episodes: int = 10,
-    num_envs: int | None = None,
-    seed: int = 0,
+    episodes: Count = 10,
+    num_envs: OptionalCount = None,
+    seed: Seed = 0,
     style: str | None = None,
     backend: Backend = "auto",
     colors: bool = False,
     extras: tuple[str, ...] = (),
-    tail_steps: int | None = None,
+    tail_steps: Annotated[int | None, AtLeast(0)] = None,
     realism: str = "clean",
     camera: Path | None = None,
     obs_preset: str = "manicm_ms",
@@ -160,7 +161,7 @@ def convert_command(
     from_: Annotated[str | None, tyro.conf.arg(name="from")] = None,
     task: str | None = None,
     env: str | None = None,
-    num_points: int | None = None,
+    num_points: OptionalCount = None,
     colors: bool = False,
     frame: str | None = None,
     control_hz: float | None = None,
@@ -189,14 +190,14 @@ def evaluate_command(
     checkpoints: tyro.conf.Positional[tuple[Path, ...]],
     env: str,
     out: Path = Path("runs/report"),
-    episodes: int = 100,
-    seed: int = 100_000,
-    num_envs: int | None = None,
+    episodes: Count = 100,
+    seed: Seed = 100_000,
+    num_envs: OptionalCount = None,
     backend: Backend = "auto",
     device: str = "cpu",
     control: bool = True,
-    videos: int = 4,
-    threads: int = 1,
+    videos: CountOrNone = 4,
+    threads: Count = 1,
     realism: str = "clean",
     camera: Path | None = None,
     obs_preset: str = "manicm_ms",
@@ -235,16 +236,16 @@ def benchmark_command(
     preset: str = "quick",
     out: Path = Path("runs/bench"),
     data: Path | None = None,
-    demos: int = 10,
-    demo_seed: int = 0,
+    demos: Count = 10,
+    demo_seed: Seed = 0,
     colors: bool = False,
     obs_preset: str = "manicm_ms",
-    episodes: int = 50,
-    eval_seed: int = 100_000,
-    evaluations: int = 0,
-    evaluation_episodes: int = 20,
-    processes: int | None = None,
-    num_envs: int = 2,
+    episodes: Count = 50,
+    eval_seed: Seed = 100_000,
+    evaluations: CountOrNone = 0,
+    evaluation_episodes: Count = 20,
+    processes: OptionalCount = None,
+    num_envs: Count = 2,
     device: str = "auto",
     ray: str | None = None,
 ) -> int:
@@ -294,7 +295,7 @@ def cloud_command(
     out: Path,
     env: str = "ur3e/slide-block",
     realism: str = "d435i",
-    num_points: int = 512,
+    num_points: Count = 512,
     overwrite: bool = False,
 ) -> None:
     """Turn a recorded depth image into the cloud that a policy sees, exactly as the simulator makes its own.
@@ -435,11 +436,14 @@ def _run(arguments: list[str]) -> int | None:
     name, rest = arguments[0], arguments[1:]
     if name not in (*_PLAIN, *_WITH_PRESET):
         raise UnknownNameError("command", name, (*_PLAIN, *_WITH_PRESET))
-    command = _training_command(name, rest) if name in _WITH_PRESET else _PLAIN[name]
-    return tyro.cli(command, prog=f"{PROGRAM} {name}", args=rest, config=(tyro.conf.OmitArgPrefixes,))
+    return tyro.cli(
+        checked(_command(name, rest)), prog=f"{PROGRAM} {name}", args=rest, config=(tyro.conf.OmitArgPrefixes,)
+    )
 
 
-def _training_command(name: str, arguments: list[str]) -> Command:
+def _command(name: str, arguments: list[str]) -> Command:
+    if name in _PLAIN:
+        return _PLAIN[name]
     from manicm_ms.cli import training  # torch and the presets: a second that the other commands need not wait
 
     return {"train": training.train_command, "distill": training.distill_command}[name](arguments)

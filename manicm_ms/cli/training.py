@@ -9,6 +9,8 @@ from typing import Annotated
 import tyro
 
 from manicm_ms.cli import this_command
+from manicm_ms.cli.counts import Seed
+from manicm_ms.errors import ConfigError
 from manicm_ms.training.presets import STUDENT_PRESETS, TEACHER_PRESETS, StudentPreset, TeacherPreset
 
 DEFAULT_PRESET = "quick"
@@ -25,7 +27,7 @@ def train_command(arguments: Sequence[str]) -> Callable[..., None]:
         recipe: Annotated[TeacherPreset, tyro.conf.arg(name="")] = default,
         preset: str = DEFAULT_PRESET,
         device: str = "auto",
-        seed: int = 0,
+        seed: Seed = 0,
     ) -> None:
         """Train a diffusion teacher on demonstrations; the same command goes on after Ctrl-C or a kill.
 
@@ -40,6 +42,8 @@ def train_command(arguments: Sequence[str]) -> Callable[..., None]:
         """
         from manicm_ms.training.teacher import train_teacher
 
+        if recipe.points != default.points:
+            _require_points(recipe.points, data)
         train_teacher(policy, data, out, recipe, device=device, seed=seed, command=this_command())
 
     return train
@@ -56,7 +60,7 @@ def distill_command(arguments: Sequence[str]) -> Callable[..., None]:
         recipe: Annotated[StudentPreset, tyro.conf.arg(name="")] = default,
         preset: str = DEFAULT_PRESET,
         device: str = "auto",
-        seed: int = 0,
+        seed: Seed = 0,
     ) -> None:
         """Distil a teacher into a one-step ManiCM student; the same command goes on after Ctrl-C or a kill.
 
@@ -74,6 +78,21 @@ def distill_command(arguments: Sequence[str]) -> Callable[..., None]:
         distill_student(teacher, data, out, recipe, device=device, seed=seed, command=this_command())
 
     return distill
+
+
+def _require_points(points: int | None, data: Path) -> None:
+    """Raise ConfigError where more points are asked for than the clouds of the store have.
+
+    A preset's own number is no such request: of smaller clouds it means all points.
+    """
+    from manicm_ms.demos.store import DemoStore
+
+    with DemoStore.open(data) as store:
+        stored = store.spec.obs.num_points
+    if points is not None and points > stored:
+        raise ConfigError(
+            f"--points {points} exceeds the {stored} points of each cloud in {data}: give {stored} or less"
+        )
 
 
 def _preset_asked(arguments: Sequence[str]) -> str:

@@ -15,7 +15,7 @@ import torch
 from torch import Tensor
 
 from manicm_ms.camera_model import CameraModel
-from manicm_ms.errors import ConfigError
+from manicm_ms.errors import ConfigError, require_at_least
 from manicm_ms.realism import Realism, RealismSample, objects_of
 from manicm_ms.registry import Registry
 from manicm_ms.types import AGENT_POS, DP3_FRAME, OBS_KEYS, POINT_CLOUD, EnvSpec
@@ -78,8 +78,7 @@ class SimulatorConfig:
             raise ConfigError(f"unknown reward_mode {self.reward_mode!r}: choose from {', '.join(REWARD_MODES)}")
         if self.obs_preset not in OBS_PRESETS:
             raise ConfigError(f"unknown obs_preset {self.obs_preset!r}: choose from {', '.join(OBS_PRESETS)}")
-        if self.num_rows < 1 or self.num_points < 1 or min(self.image_size) < 1:
-            raise ConfigError(f"num_envs, num_points and image_size must be at least 1, got {self}")
+        require_at_least(1, num_envs=self.num_rows, num_points=self.num_points, image_size=min(self.image_size))
 
     def require_ideal(self, env_id: str) -> None:
         """Raise ConfigError unless realism and camera are left out: for simulators that know neither."""

@@ -16,7 +16,7 @@ from rich.progress import Progress
 
 from manicm_ms.camera_model import CameraModel, read_camera
 from manicm_ms.devices import resolve_device, torch_threads
-from manicm_ms.errors import ConfigError, OutputExistsError, SpecMismatchError
+from manicm_ms.errors import ConfigError, OutputExistsError, SpecMismatchError, require_at_least
 from manicm_ms.evaluation.latency import Latency, measure_latency
 from manicm_ms.evaluation.machine import machine
 from manicm_ms.evaluation.records import EpisodeLog, claimed_folder
@@ -88,8 +88,8 @@ class Protocol:
         if not self.seeds:
             raise ConfigError("an evaluation needs at least one episode")
         require_seed(min(self.seeds))
-        if min(self.num_envs, self.threads, self.repetitions) < 1 or self.videos < 0:
-            raise ConfigError(f"num_envs, threads and repetitions must be at least 1 and videos at least 0, got {self}")
+        require_at_least(1, num_envs=self.num_envs, threads=self.threads, repetitions=self.repetitions)
+        require_at_least(0, videos=self.videos)
 
 
 class EnvMaker(NamedTuple):
@@ -163,7 +163,7 @@ def evaluate(
     if episodes < 1:
         raise ConfigError(f"--episodes must be at least 1, got {episodes}")
     seeds, presets = tuple(range(seed, seed + episodes)), parse_presets(realism)
-    rows = min(num_envs or default_num_envs(), episodes)
+    rows = min(default_num_envs() if num_envs is None else num_envs, episodes)
     protocol = Protocol(env_id, seeds, rows, threads, repetitions, videos, presets)
     model = None if camera is None else read_camera(camera)
     entry = ENVS.get(env_id)

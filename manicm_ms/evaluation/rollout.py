@@ -109,7 +109,11 @@ def require_chunk(vec_env: VecEnv, chunk: ChunkSpec) -> None:
     theirs = vec_env.chunk
     ours = (chunk.n_obs_steps, chunk.n_action_steps)
     if theirs is None or (theirs.n_obs_steps, theirs.n_action_steps) != ours:
-        raise ConfigError(f"the env plays {theirs} and the policy {chunk}: make the env with chunk=policy.chunk")
+        plays = "no chunks" if theirs is None else f"{theirs.n_action_steps} actions for {theirs.n_obs_steps} frames"
+        raise ConfigError(
+            f"the env plays {plays} and the policy {chunk.n_action_steps} actions for {chunk.n_obs_steps}: "
+            "make the env with chunk=policy.chunk"
+        )
 
 
 def rollout(

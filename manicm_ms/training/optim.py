@@ -13,7 +13,7 @@ from torch.optim import AdamW
 from torch.optim.lr_scheduler import LambdaLR
 from torch.optim.swa_utils import AveragedModel
 
-from manicm_ms.errors import ConfigError
+from manicm_ms.errors import ConfigError, require_at_least
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -51,9 +51,9 @@ class FitConfig:
     def __post_init__(self) -> None:
         if (self.steps is None) == (self.epochs is None):
             raise ConfigError(f"give steps or epochs, one of the two: got steps={self.steps}, epochs={self.epochs}")
-        length = self.steps if self.epochs is None else self.epochs
-        if min(length or 0, self.batch_size, self.threads, self.log_every, self.save_every) < 1:
-            raise ConfigError("steps or epochs, batch_size, threads, log_every and save_every must be at least 1")
+        length = {"epochs": self.epochs} if self.steps is None else {"steps": self.steps}
+        require_at_least(1, **length, batch_size=self.batch_size, threads=self.threads)
+        require_at_least(1, log_every=self.log_every, save_every=self.save_every)
         if self.warmup_steps < 0 or self.learning_rate <= 0 or self.weight_decay < 0:
             raise ConfigError("learning_rate must be positive, warmup_steps and weight_decay not negative")
         if self.steps is not None and self.warmup_steps >= self.steps:
@@ -122,7 +122,7 @@ class PowerDecay:
 
     def __post_init__(self) -> None:
         if self.power <= 0 or not 0 <= self.max_decay < 1:
-            raise ConfigError(f"power must be positive and max_decay in [0, 1), got {self}")
+            raise ConfigError(f"power must be positive and max_decay in [0, 1), got {self.power} and {self.max_decay}")
 
     def __call__(self, count: int) -> float:
         """Return the decay of average number `count`, counted from 0; the first one is a plain copy."""

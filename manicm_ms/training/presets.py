@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import asdict, dataclass
 from typing import Any
 
-from manicm_ms.errors import ConfigError
+from manicm_ms.errors import ConfigError, require_at_least
 from manicm_ms.policies.points import POINT_CHOICES
 from manicm_ms.registry import Registry
 from manicm_ms.training.optim import FitConfig
@@ -88,8 +88,7 @@ class StudentPreset(FitConfig):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        if self.skip < 1 or self.draws < 1 or self.nfe < 1:
-            raise ConfigError(f"skip, draws and nfe must be at least 1, got {self.skip}, {self.draws}, {self.nfe}")
+        require_at_least(1, skip=self.skip, draws=self.draws, nfe=self.nfe)
         if not 0 <= self.mu < 1:
             raise ConfigError(f"mu must lie in [0, 1), got {self.mu}")
 

@@ -6,13 +6,15 @@ import signal
 import subprocess
 import sys
 import time
+from typing import get_type_hints
 
 import point_mass_env
 import pytest
 from reach_demos import make_store
 
 from manicm_ms import __version__
-from manicm_ms.cli import INTERRUPTED, USER_ERROR, _explain, main
+from manicm_ms.cli import INTERRUPTED, USER_ERROR, _command, _explain, main
+from manicm_ms.cli.counts import least_values
 from manicm_ms.policies.checkpoint import read_manifest, verify_checkpoint
 from manicm_ms.training.log import read_log
 from manicm_ms.training.run_folder import training_folder
@@ -61,6 +63,7 @@ def assert_one_line(result, *parts):
     assert status == USER_ERROR
     assert err.startswith("manicm-ms: ")
     assert err.count("\n") == 1, err
+    assert not re.search(r"[A-Z]\w+\(\w+=", err), "no dataclass is shown as Python writes it"
     for part in parts:
         assert part in err
 
@@ -244,3 +247,48 @@ def test_ctrl_c_ends_with_130_and_the_same_command_goes_on(told, demos, tmp_path
     assert [line["step"] for line in read_log(log)] == list(range(1, STEPS + 1))
     assert read_manifest(teacher)["provenance"]["command"].startswith("manicm-ms train simple_dp3 --data ")
     assert f"{teacher} is finished: nothing to do" in told(*command)[2]
+
+
+# ---- counts
+
+
+REQUIRED = {
+    "evaluate": ("x", "--env", "ur3e/slide-block"),
+    "convert": ("x", "--out", "y"),
+    "cloud": ("x", "--camera", "y", "--out", "z.ply"),
+    "train": ("dp3", "--data", "x", "--out", "y"),
+    "distill": ("--teacher", "x", "--data", "y", "--out", "z"),
+}
+"""What the commands that take whole numbers cannot be called without."""
+WHOLE_NUMBERS = [
+    (command, option, least)
+    for command in COMMANDS
+    for option, least in least_values(_command(command, [])).items()
+]  # fmt: skip
+
+
+@pytest.mark.parametrize("command", COMMANDS)
+def test_every_whole_number_says_the_least_that_it_takes(command):
+    hints = get_type_hints(_command(command, []))
+    whole = {name for name, hint in hints.items() if int in (hint, *getattr(hint, "__args__", ()))}
+    pairs = {"squares"}  # of a board, which says itself what it may have
+    assert whole - pairs - {"return"} == set(least_values(_command(command, [])))
+
+
+@pytest.mark.parametrize(("command", "option", "least"), WHOLE_NUMBERS)
+def test_less_than_the_least_is_refused(told, command, option, least):
+    name = f"--{option.replace('_', '-')}"
+    result = told(command, *REQUIRED.get(command, ()), name, least - 1)
+    assert_one_line(result, f"{name} must be at least {least}, got {least - 1}")
+
+
+@pytest.mark.parametrize("option", ["steps", "batch-size", "points", "save-every", "log-every", "n-action-steps"])
+def test_counts_of_a_recipe_are_refused_too(told, demos, tmp_path, option):
+    result = told("train", "dp3", "--data", demos, "--out", tmp_path / "out", f"--{option}", 0)
+    assert_one_line(result, option.replace("-", "_"), "at least 1")
+
+
+def test_more_points_than_the_clouds_have_are_refused(told, demos, tmp_path):
+    result = told("train", "dp3", "--data", demos, "--out", tmp_path / "out", "--points", 65)
+    assert_one_line(result, "--points 65 exceeds the 64 points of each cloud", "reach.zarr", "give 64 or less")
+    assert not (tmp_path / "out").exists()
