@@ -267,6 +267,7 @@ for _row in TASKS:
             obs_presets=(MANICM_MS, DP3),
             has_realism=False,
             group=_row.group,
+            seed_limit=2**63,  # their random streams take any; stores keep 64 bits
             preload=("manicm_ms.envs.mujoco", "gymnasium.envs.mujoco.mujoco_env"),
             # Never cut: success must hold at the end, so a policy has to see how it is held.
             demos=DemoRule(_row.demo_success_steps, tail_steps=_row.max_episode_steps),

@@ -255,6 +255,7 @@ for _row in TASKS:
             obs_presets=(MANICM_MS, DP3),
             has_realism=False,
             group=_row.group,
+            seed_limit=2**63,  # their random streams take any; stores keep 64 bits
             preload=("manicm_ms.envs.mujoco", "metaworld.env_dict"),
             demos=DemoRule(_row.demo_success_steps),
         ),

@@ -8,6 +8,7 @@ import torch
 from torch import Tensor
 
 from manicm_ms.envs.simulator import Simulator, StepResult
+from manicm_ms.errors import ManicmError
 from manicm_ms.types import ChunkSpec
 
 _DIVERGED = "the simulation diverged: the observation holds NaN or infinity"
@@ -25,7 +26,7 @@ class ActionChunk:
     A row that ends inside a chunk stops there: its last frame is rendered, its other actions are not played, and
     it stays as it is until it is reset. A row whose observation is not finite has crashed: it is terminated without
     success, with the reason in `errors`, and keeps its last finite history. Where the simulator raises, all rows that
-    were playing have crashed.
+    were playing, or were to be reset, have crashed; at the first reset, which has no frame to show, the error goes on.
 
     Args:
         simulator: the n rows.
@@ -54,8 +55,11 @@ class ActionChunk:
         return cls(simulator, chunk.n_obs_steps, chunk.n_action_steps)
 
     def reset(self, rows: Tensor, seeds: Sequence[int]) -> tuple[dict[str, Tensor], dict[str, Tensor]]:
-        """Start new episodes in `rows` (k,) int64; return all rows' histories (n, To, ...) and info (n,)."""
-        self.simulator.reset(rows, seeds)
+        """Start new episodes in `rows` (k,) int64; return all rows' histories (n, To, ...) and info (n,).
+
+        Raises ManicmError, and at the first reset whatever the simulator raises.
+        """
+        frame, trouble = self._start(rows, seeds)
         for flags in (self.terminated, self.truncated, self.success_once):
             flags[rows] = False
         for counts in (self.elapsed, self.clipped):
@@ -64,11 +68,25 @@ class ActionChunk:
             self.errors[row] = None
         for name, values in self._info.items():
             self._info[name] = values.index_fill(0, rows, 0)
-        frame = self.simulator.observe()
-        self._restart_history(frame, rows)
         fresh = torch.zeros_like(self.terminated).index_fill(0, rows, True)
-        self._crash(fresh & ~_finite(frame), _DIVERGED)
+        if frame is None:
+            self._crash(fresh, trouble)
+        else:
+            self._restart_history(frame, rows)
+            self._crash(fresh & ~_finite(frame), _DIVERGED)
         return dict(self._history), self.info()
+
+    def _start(self, rows: Tensor, seeds: Sequence[int]) -> tuple[dict[str, Tensor] | None, str]:
+        """Reset the simulator's rows and observe; return the frame, or None and why there is none."""
+        try:
+            self.simulator.reset(rows, seeds)
+            return self.simulator.observe(), ""
+        except ManicmError:  # the machine's or the user's trouble: the next seed would meet it again
+            raise
+        except Exception as error:
+            if not self._history:
+                raise
+            return None, f"{type(error).__name__}: {error}"
 
     def step(self, actions: Tensor) -> tuple[dict[str, Tensor], Tensor, dict[str, Tensor]]:
         """Play actions (n, Ta, Da); return histories (n, To, ...), summed rewards (n,) and info (n,)."""

@@ -55,7 +55,7 @@ class _Checks:
         self._episode: list[Obs] = []
 
     def _make(self, num_envs: int, **options: object) -> VecEnv:
-        return make_vec(self._env_id, num_envs, self._backend, **options)  # type: ignore[arg-type]
+        return make_vec(self._env_id, num_envs, self._backend, **options)  # type: ignore[call-overload]
 
     def _actions(self, env: VecEnv, steps: int = _STEPS) -> Tensor:
         """Return the same smooth random actions (steps, N, Da) for every row, whatever N."""

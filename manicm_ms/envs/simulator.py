@@ -155,6 +155,7 @@ class EnvEntry:
         preload: modules that take long to import and that worker processes may share; a missing one is no error.
         demos: which episodes of its expert become demonstrations.
         group: column of the benchmark's table that it belongs to; empty for that of its suite.
+        seed_limit: seeds lie in [0, seed_limit); ManiSkill's random streams take 32 bits.
     """
 
     spec: EnvSpec
@@ -167,6 +168,7 @@ class EnvEntry:
     preload: tuple[str, ...] = ()
     demos: DemoRule = DemoRule()
     group: str = ""
+    seed_limit: int = 2**32
 
     def require(self, config: SimulatorConfig) -> None:
         """Raise ConfigError where `config` asks for what this environment does not have."""

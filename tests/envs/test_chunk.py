@@ -193,6 +193,32 @@ def test_a_row_that_starts_diverged_is_ended_at_once():
     assert rows.errors == [None, DIVERGED]
 
 
+def fail(*_):
+    raise ValueError("no such scene")
+
+
+def test_a_simulator_that_raises_at_a_reset_crashes_those_rows_alone():
+    """On a GPU all rows live in one process: an error that went on would end the episodes of the others too."""
+    rows, *_ = make(2)
+    before, *_ = rows.step(actions(rows, *[(0.1, 0.0)] * 3))
+    rows.simulator.start = fail
+    history, info = rows.reset(torch.tensor([0]), [7])
+    assert rows.errors == ["ValueError: no such scene", None]
+    assert rows.terminated.tolist() == [True, False]
+    assert info["elapsed_steps"].tolist() == [0, 3]
+    assert torch.equal(history[AGENT_POS][1], before[AGENT_POS][1])
+    _, reward, info = rows.step(actions(rows, *[(0.1, 0.0)] * 3))
+    assert info["elapsed_steps"].tolist() == [0, 6]
+    assert reward[0] == 0
+
+
+def test_the_first_reset_has_no_frame_to_go_on_with():
+    rows = ActionChunk(point_mass_env.build(1))
+    rows.simulator.start = fail
+    with pytest.raises(ValueError, match="no such scene"):
+        rows.reset(torch.tensor([0]), [0])
+
+
 def test_rows_that_had_succeeded_keep_their_success_when_another_crashes():
     rows, *_ = make(2, n_action_steps=1)
     put(rows, 0, x=GOAL_X)

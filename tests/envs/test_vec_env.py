@@ -9,6 +9,7 @@ import numpy as np
 import point_mass_env
 import pytest
 import torch
+from gymnasium.vector import AutoresetMode
 from point_mass_env import BROKEN, RAISING, SOUND
 
 from manicm_ms.envs.conformance import PROPERTIES, check_vec_env
@@ -78,6 +79,7 @@ def env():
 
 def test_says_what_it_is(env):
     assert env.backend == "cpu"
+    assert env.autoreset_mode is env.metadata["autoreset_mode"] is AutoresetMode.DISABLED
     assert env.device == torch.device("cpu")
     assert env.num_envs == 2
     assert env.chunk is None
@@ -121,18 +123,23 @@ def test_crash_of_a_row_is_told_and_the_other_goes_on(env):
     assert info["error"] == [None, None]
 
 
-def test_reset_mask_of_nobody_changes_nothing(env):
-    before = env.step(torch.full((2, 2), 0.1))[0]
-    after, info = env.reset(seed=[8, 9], options={"reset_mask": np.zeros(2, dtype=bool)})
-    assert torch.equal(before[AGENT_POS], after[AGENT_POS])
-    assert info["elapsed_steps"].tolist() == [1, 1]
-
-
 def test_seed_forms(env):
     counted = env.reset(seed=4)[0][AGENT_POS]
-    listed = env.reset(seed=[4, 5])[0][AGENT_POS]
-    assert torch.equal(counted, listed)
+    for listed in ([4, 5], (4, 5), np.array([4, 5]), torch.tensor([4, 5])):
+        assert torch.equal(counted, env.reset(seed=listed)[0][AGENT_POS])
     assert not torch.equal(env.reset()[0][AGENT_POS], env.reset()[0][AGENT_POS])
+
+
+def test_resets_without_a_seed_go_on_from_the_last_one(env):
+    def starts():
+        env.reset(seed=5)
+        return [env.reset()[0][AGENT_POS], env.reset(seed=[None, 6])[0][AGENT_POS], env.reset()[0][AGENT_POS]]
+
+    first, again = starts(), starts()
+    assert all(torch.equal(a, b) for a, b in zip(first, again, strict=True))
+    torch.testing.assert_close(first[1][1], torch.rand(2, generator=torch.Generator().manual_seed(6)) * 0.1)
+    assert not torch.equal(first[0], first[1])
+    assert torch.equal(first[0][1], first[2][1]), "the second row's stream began again with its seed 6"
 
 
 @pytest.mark.parametrize(
@@ -161,14 +168,27 @@ def test_bad_resets(env):
     for mask in (np.array([True]), np.array([1, 0])):
         with pytest.raises(ConfigError, match="reset_mask must be"):
             env.reset(seed=[1, 2], options={"reset_mask": mask})
+    with pytest.raises(ConfigError, match="names no row"):
+        env.reset(options={"reset_mask": np.zeros(2, dtype=bool)})
+    for options, words in (({"mask": [True, False]}, "'mask': did you mean 'reset_mask'"), ([True, False], "dictionary")):
+        with pytest.raises(ConfigError, match=words):
+            env.reset(options=options)
+    for seed in (-1, 2**32, 2**32 - 1, [0, -7], 1.5, "3", True, [0, 1.0]):
+        with pytest.raises(ConfigError, match=f"seed .*{SOUND} takes whole numbers from 0 to 4294967295"):
+            env.reset(seed=seed)
+    _, info = env.reset(seed=[2**32 - 1, 0])
+    assert info["error"] == [None, None], "none of these has harmed the workers"
 
 
-@pytest.mark.parametrize("mask", [[False, False], [True, False]])
-def test_first_reset_must_cover_every_row(mask):
-    entry, config = ENVS.get(SOUND), SimulatorConfig(num_rows=2)
+def test_first_reset_must_cover_every_row():
+    mask = [True, False]
+    entry, config = ENVS.get(SOUND), SimulatorConfig(num_rows=2, video=True)
     on_gpu_code = GpuVecEnv(entry, config.specialise(entry.spec), 2, config, None)
-    for env in (make_vec(SOUND, 2, "cpu"), on_gpu_code):
+    for env in (make_vec(SOUND, 2, "cpu", video=True), on_gpu_code):
         with closing(env):
+            for early in (lambda env=env: env.step(torch.zeros(2, 2)), env.render_video_frames):
+                with pytest.raises(ConfigError, match="before the first reset"):
+                    early()
             with pytest.raises(ConfigError, match="the first reset must cover every row"):
                 env.reset(seed=[1, 2], options={"reset_mask": np.array(mask)})
             env.reset(seed=[1, 2])
@@ -178,7 +198,9 @@ def test_first_reset_must_cover_every_row(mask):
 def test_video_must_be_asked_for(env):
     with pytest.raises(ConfigError, match="video=True"):
         env.render_video_frames()
+    assert env.render_mode is None
     with closing(make_vec(SOUND, 2, "cpu", video=True)) as filmed:
+        assert filmed.render_mode == "rgb_array"
         filmed.reset(seed=[1, 2])
         frames = filmed.render_video_frames()
     assert frames.shape == (2, 4, 4, 3)
@@ -217,32 +239,45 @@ def test_killed_worker_is_told_and_closing_still_works():
     assert not other.is_alive()
 
 
+def test_an_error_at_a_reset_fails_its_row_and_the_environment_lives():
+    with closing(make_vec(RAISING, 2, "cpu", obs=(AGENT_POS,))) as env:
+        env.reset(seed=[1, 2])
+        _, info = env.reset(seed=[1, 13])
+        assert info["error"] == [None, "RuntimeError: a long story:\nno start for this seed"]
+        *_, terminated, _, info = env.step(torch.zeros(2, 2))
+        assert terminated.tolist() == [False, True]
+        assert info["elapsed_steps"].tolist() == [1, 0]
+        assert env.reset(seed=[1, 2])[1]["error"] == [None, None]
+
+
 @pytest.mark.parametrize(
-    ("seed", "kind", "message"),
+    ("first", "seed", "kind", "message"),
     [
-        (13, BackendError, r"^a worker process of toy/raising failed \(no start for this seed\): .*make it anew"),
-        (14, RenderDeviceError, "^no device: install one$"),
+        (13, 1, BackendError, r"^a worker process of toy/raising failed \(no start for this seed\): .*make it anew"),
+        (1, 14, RenderDeviceError, "^no device: install one$"),
     ],
 )
-def test_an_error_in_a_worker_ends_the_environment(seed, kind, message):
+def test_an_error_in_a_worker_ends_the_environment(first, seed, kind, message):
     env = make_vec(RAISING, 2, "cpu", obs=(AGENT_POS,), video=True)
-    env.reset(seed=[1, 2])
-    with pytest.raises(kind, match=message) as first:
+    with pytest.raises(kind, match=message) as told:
+        env.reset(seed=[1, first])
         env.reset(seed=[1, seed])
-    assert "\n" not in str(first.value)
+    assert "\n" not in str(told.value)
     if kind is BackendError:
-        assert isinstance(first.value.__cause__, RuntimeError)
-    nobody = {"reset_mask": np.zeros(2, dtype=bool)}
+        assert isinstance(told.value.__cause__, RuntimeError)
     for call in (
         lambda: env.step(torch.zeros(2, 2)),
         lambda: env.reset(seed=[1, 2]),
-        lambda: env.reset(options=nobody),
         env.render_video_frames,
     ):
+        if first == 13:
+            env._every_row_started = True  # else the missing reset would be told
         with pytest.raises(BackendError, match=r"toy/raising failed .*make it anew"):
             call()
     env.close()
     env.close()
+    with pytest.raises(ConfigError, match="closed"):
+        env.reset()
 
 
 def test_closing_ends_the_workers():
