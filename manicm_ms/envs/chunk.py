@@ -59,7 +59,7 @@ class ActionChunk:
 
         Raises ManicmError, and at the first reset whatever the simulator raises.
         """
-        frame, trouble = self._start(rows, seeds)
+        failed = self._start(rows, seeds)
         for flags in (self.terminated, self.truncated, self.success_once):
             flags[rows] = False
         for counts in (self.elapsed, self.clipped):
@@ -69,24 +69,43 @@ class ActionChunk:
         for name, values in self._info.items():
             self._info[name] = values.index_fill(0, rows, 0)
         fresh = torch.zeros_like(self.terminated).index_fill(0, rows, True)
-        if frame is None:
-            self._crash(fresh, trouble)
-        else:
-            self._restart_history(frame, rows)
+        for row, reason in failed.items():
+            fresh[row] = False
+            self._crash(torch.zeros_like(fresh).index_fill(0, torch.as_tensor(row, device=fresh.device), True), reason)
+        frame = self._first_frame(fresh)
+        if frame is not None:
+            self._restart_history(frame, fresh.nonzero().flatten())
             self._crash(fresh & ~_finite(frame), _DIVERGED)
         return dict(self._history), self.info()
 
-    def _start(self, rows: Tensor, seeds: Sequence[int]) -> tuple[dict[str, Tensor] | None, str]:
-        """Reset the simulator's rows and observe; return the frame, or None and why there is none."""
+    def _start(self, rows: Tensor, seeds: Sequence[int]) -> dict[int, str]:
+        """Reset the simulator's rows, where that fails one by one; return why a row could not be, row -> reason."""
         try:
             self.simulator.reset(rows, seeds)
-            return self.simulator.observe(), ""
         except ManicmError:  # the machine's or the user's trouble: the next seed would meet it again
             raise
         except Exception as error:
             if not self._history:
                 raise
-            return None, f"{type(error).__name__}: {error}"
+            if len(rows) == 1:
+                return {int(rows[0]): _reason(error)}
+            failed: dict[int, str] = {}
+            for k, seed in enumerate(seeds):
+                failed |= self._start(rows[k : k + 1], [seed])
+            return failed
+        return {}
+
+    def _first_frame(self, fresh: Tensor) -> dict[str, Tensor] | None:
+        """Observe after a reset; return None where that fails, and the rows `fresh` (n,) bool have crashed."""
+        try:
+            return self.simulator.observe()
+        except ManicmError:
+            raise
+        except Exception as error:
+            if not self._history:
+                raise
+            self._crash(fresh, _reason(error))
+            return None
 
     def step(self, actions: Tensor) -> tuple[dict[str, Tensor], Tensor, dict[str, Tensor]]:
         """Play actions (n, Ta, Da); return histories (n, To, ...), summed rewards (n,) and info (n,)."""
@@ -103,7 +122,7 @@ class ActionChunk:
                 if k >= self.n_action_steps - self.n_obs_steps or ended.any():
                     ended |= self._read(active)
             except Exception as error:  # whatever the simulator raises ends these episodes, not the run
-                self._crash(active, f"{type(error).__name__}: {error}")
+                self._crash(active, _reason(error))
                 break
             reward += torch.where(active & torch.isfinite(result.reward), result.reward, 0.0)
             active = active & ~ended
@@ -158,6 +177,10 @@ class ActionChunk:
             old = self._history[key]
             new = torch.cat([old[:, 1:], values[:, None]], dim=1)
             self._history[key] = torch.where(active.view(-1, *[1] * values.dim()), new, old)
+
+
+def _reason(error: Exception) -> str:
+    return f"{type(error).__name__}: {error}"
 
 
 def _finite(frame: dict[str, Tensor]) -> Tensor:

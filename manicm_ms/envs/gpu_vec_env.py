@@ -55,7 +55,8 @@ class GpuVecEnv(VecEnv):
         self._rows.simulator.close()
 
     def _unchunk(self, history: Obs) -> Obs:
-        return {key: values if self.chunk else values[:, 0] for key, values in history.items()}
+        # A copy: the next history is made of this one, whatever its reader writes into it.
+        return {key: (values if self.chunk else values[:, 0]).clone() for key, values in history.items()}
 
     def _with_errors(self, info: dict[str, Tensor]) -> Info:
         return {**info, "error": list(self._rows.errors)}

@@ -193,28 +193,42 @@ def test_a_row_that_starts_diverged_is_ended_at_once():
     assert rows.errors == [None, DIVERGED]
 
 
-def fail(*_):
-    raise ValueError("no such scene")
+def fail_at(bad):
+    def start(seed):
+        if seed == bad:
+            raise ValueError("no such scene")
+        return torch.zeros(2)
+
+    return start
 
 
-def test_a_simulator_that_raises_at_a_reset_crashes_those_rows_alone():
+def test_a_seed_that_raises_at_its_reset_crashes_its_row_alone():
     """On a GPU all rows live in one process: an error that went on would end the episodes of the others too."""
-    rows, *_ = make(2)
-    before, *_ = rows.step(actions(rows, *[(0.1, 0.0)] * 3))
-    rows.simulator.start = fail
-    history, info = rows.reset(torch.tensor([0]), [7])
-    assert rows.errors == ["ValueError: no such scene", None]
-    assert rows.terminated.tolist() == [True, False]
-    assert info["elapsed_steps"].tolist() == [0, 3]
+    rows, *_ = make(3)
+    before, *_ = rows.step(actions(rows, *[(0.1, 0.05)] * 3))
+    rows.simulator.start = fail_at(7)
+    history, info = rows.reset(torch.tensor([0, 2]), [7, 8])
+    assert rows.errors == ["ValueError: no such scene", None, None]
+    assert rows.terminated.tolist() == [True, False, False]
+    assert info["elapsed_steps"].tolist() == [0, 3, 0]
     assert torch.equal(history[AGENT_POS][1], before[AGENT_POS][1])
+    assert history[AGENT_POS][2].abs().max() == 0
     _, reward, info = rows.step(actions(rows, *[(0.1, 0.0)] * 3))
-    assert info["elapsed_steps"].tolist() == [0, 6]
+    assert info["elapsed_steps"].tolist() == [0, 6, 3]
     assert reward[0] == 0
+
+
+def test_a_first_frame_that_raises_crashes_the_rows_that_were_reset():
+    rows, *_ = make(2)
+    rows.simulator.start = lambda seed: torch.tensor([0.0, RAISE_Y - 1])
+    _, info = rows.reset(torch.tensor([1]), [3])
+    assert rows.errors == [None, "ValueError: no picture"]
+    assert info["success"].tolist() == [False, False]
 
 
 def test_the_first_reset_has_no_frame_to_go_on_with():
     rows = ActionChunk(point_mass_env.build(1))
-    rows.simulator.start = fail
+    rows.simulator.start = fail_at(0)
     with pytest.raises(ValueError, match="no such scene"):
         rows.reset(torch.tensor([0]), [0])
 

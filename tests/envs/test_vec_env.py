@@ -170,7 +170,10 @@ def test_bad_resets(env):
             env.reset(seed=[1, 2], options={"reset_mask": mask})
     with pytest.raises(ConfigError, match="names no row"):
         env.reset(options={"reset_mask": np.zeros(2, dtype=bool)})
-    for options, words in (({"mask": [True, False]}, "'mask': did you mean 'reset_mask'"), ([True, False], "dictionary")):
+    for options, words in (
+        ({"mask": [True, False]}, "'mask': did you mean 'reset_mask'"),
+        ([True, False], "dictionary"),
+    ):
         with pytest.raises(ConfigError, match=words):
             env.reset(options=options)
     for seed in (-1, 2**32, 2**32 - 1, [0, -7], 1.5, "3", True, [0, 1.0]):
@@ -259,9 +262,10 @@ def test_an_error_at_a_reset_fails_its_row_and_the_environment_lives():
 )
 def test_an_error_in_a_worker_ends_the_environment(first, seed, kind, message):
     env = make_vec(RAISING, 2, "cpu", obs=(AGENT_POS,), video=True)
+    if first == 1:
+        env.reset(seed=[1, 1])
     with pytest.raises(kind, match=message) as told:
-        env.reset(seed=[1, first])
-        env.reset(seed=[1, seed])
+        env.reset(seed=[1, seed if first == 1 else first])
     assert "\n" not in str(told.value)
     if kind is BackendError:
         assert isinstance(told.value.__cause__, RuntimeError)
