@@ -24,10 +24,11 @@ from manicm_ms.policies.consistency import (
     boundary_scalings,
     consistency_pair,
 )
-from manicm_ms.policies.diffusion import DiffusionConfig
+from manicm_ms.policies.diffusion import DiffusionConfig, Guess, epsilon_from_x0
 from manicm_ms.policies.unet1d import SinusoidalEmbedding
 
 DIFFUSION = DiffusionConfig()
+ABAR = DIFFUSION.ddpm().alphas_cumprod
 MODES = torch.tensor([[0.6, 0.3], [-0.6, -0.3]])
 MODE_STD = 0.03
 ON_MODE = 3 * MODE_STD  # distance to the nearer mode below which a sample counts as on it
@@ -86,11 +87,17 @@ def consistency(network: Network, x_t: Tensor, t: Tensor, c: Tensor) -> Tensor:
     return c_skip[:, None] * x_t + c_out[:, None] * network(x_t, t, c)
 
 
+def guess(teacher: Network, x_t: Tensor, t: Tensor, c: Tensor) -> Guess:
+    """Return the teacher's x0, not clipped, and the epsilon that goes with it, (n, 2) each."""
+    x0 = teacher(x_t, t, c)
+    return Guess(x0, epsilon_from_x0(x_t, x0, ABAR[t][:, None]))
+
+
 Data = Callable[[int, torch.Generator], tuple[Tensor, Tensor]]
 
 
-def _noisy(x0: Tensor, t: Tensor, abar: Tensor, generator: torch.Generator) -> Tensor:
-    a = abar[t][:, None]
+def _noisy(x0: Tensor, t: Tensor, generator: torch.Generator) -> Tensor:
+    a = ABAR[t][:, None]
     return a.sqrt() * x0 + (1 - a).sqrt() * torch.randn(x0.shape, generator=generator)
 
 
@@ -104,13 +111,12 @@ def train_teacher(data: Data, budget: Budget, seed: int) -> Network:
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(seed)
         network = Network()
-    abar = DIFFUSION.ddpm().alphas_cumprod
     optimizer = torch.optim.AdamW(network.parameters(), lr=1e-3, weight_decay=1e-6)
     schedule = _cosine(optimizer, budget.teacher)
     for _ in range(budget.teacher):
         c, x0 = data(budget.batch, generator)
-        t = torch.randint(len(abar), (budget.batch,), generator=generator)
-        loss = (network(_noisy(x0, t, abar, generator), t, c) - x0).square().mean()
+        t = torch.randint(len(ABAR), (budget.batch,), generator=generator)
+        loss = (network(_noisy(x0, t, generator), t, c) - x0).square().mean()
         optimizer.zero_grad()
         loss.backward()
         optimizer.step()
@@ -125,7 +131,7 @@ def _pair(
     teacher, online, target = networks
     return consistency_pair(
         solver,
-        teacher=lambda x, t: teacher(x, t, c),
+        teacher=lambda x, t: guess(teacher, x, t, c),
         online=lambda x, t: consistency(online, x, t, c),
         target=lambda x, t: consistency(target, x, t, c),
         x_t=x_t,
@@ -138,13 +144,12 @@ def distil(teacher: Network, solver: ConsistencySolver, data: Data, budget: Budg
     generator = torch.Generator().manual_seed(seed)
     online = copy.deepcopy(teacher).requires_grad_(True)
     target = copy.deepcopy(teacher)
-    abar = DIFFUSION.ddpm().alphas_cumprod
     optimizer = torch.optim.AdamW(online.parameters(), lr=5e-4, weight_decay=1e-6)
     schedule = _cosine(optimizer, budget.student)
     for _ in range(budget.student):
         c, x0 = data(budget.batch, generator)
         index = torch.randint(len(solver), (budget.batch,), generator=generator)
-        x_t = _noisy(x0, solver.timesteps[index], abar, generator)
+        x_t = _noisy(x0, solver.timesteps[index], generator)
         prediction, wanted = _pair(solver, (teacher, online, target), c, x_t, index)
         optimizer.zero_grad()
         (prediction - wanted).square().mean().backward()
@@ -166,10 +171,10 @@ def sample_ddim(teacher: Network, noise: Tensor, c: Tensor) -> Tensor:
 
 def sample_path(teacher: Network, noise: Tensor, c: Tensor) -> Tensor:
     """Return actions (n, 2) by following the students' own grid (99 ... 9, then the clean action)."""
-    solver, x = CorrectedSolver(DIFFUSION.ddpm().alphas_cumprod), noise
+    solver, x = CorrectedSolver(ABAR), noise
     for i in reversed(range(len(solver))):
         index = torch.full((len(x),), i)
-        x = solver.previous(x, teacher(x, solver.timesteps[index], c), index)
+        x = solver.previous(guess(teacher, x, solver.timesteps[index], c), index)
     return x
 
 
@@ -238,9 +243,8 @@ def run(data: Data, budget: Budget, seed: int, solvers: Solvers) -> tuple[dict[s
         "teacher, 10 steps on the solver's grid": sample_path(teacher, noise, c),
         "teacher, 1 step": teacher(noise, last, c),
     }
-    abar = DIFFUSION.ddpm().alphas_cumprod
     for name, make in solvers.items():
-        rows[f"student, {name}"] = sample_student(distil(teacher, make(abar), data, budget, seed), noise, c)
+        rows[f"student, {name}"] = sample_student(distil(teacher, make(ABAR), data, budget, seed), noise, c)
     return rows, truth
 
 

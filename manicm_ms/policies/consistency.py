@@ -14,10 +14,13 @@ import torch
 from torch import Tensor
 
 from manicm_ms.errors import ConfigError
-from manicm_ms.policies.diffusion import epsilon_from_x0
+from manicm_ms.policies.diffusion import Guess
+from manicm_ms.registry import Registry
 
 Denoise = Callable[[Tensor, Tensor], Tensor]
 """(x_t (B, ...), t (B,) int64) -> x0 (B, ...): conditioning is closed over."""
+Teach = Callable[[Tensor, Tensor], Guess]
+"""(x_t (B, ...), t (B,) int64) -> the teacher's x0 and epsilon, each (B, ...)."""
 
 SIGMA_DATA = 0.5
 TIMESTEP_SCALING = 10.0
@@ -44,8 +47,31 @@ def boundary_scalings(
     return sigma_data**2 / power, scaled / power.sqrt()
 
 
-def solver_timesteps(num_train_timesteps: int = 100, num_solver_steps: int = 10) -> Tensor:
-    """Return the grid (K,) int64 of times on which a student is trained: 9, 19, ..., 99 for 10 of 100 steps.
+SPACINGS: Registry[Callable[[int, int], Tensor]] = Registry("timestep_spacing")
+"""name (diffusers' words) -> (T, K) -> ascending times (int64) that a student is trained on and starts from."""
+
+
+@SPACINGS.register("trailing")
+def trailing(num_train_timesteps: int, num_solver_steps: int) -> Tensor:
+    """Return K times up to the last one, T - 1: 9, 19, ..., 99 for 10 of 100."""
+    return torch.arange(1, num_solver_steps + 1) * (num_train_timesteps // num_solver_steps) - 1
+
+
+@SPACINGS.register("leading")
+def leading(num_train_timesteps: int, num_solver_steps: int) -> Tensor:
+    """Return the K - 1 times of the teacher's DDIM of K steps, 10, 20, ..., 90 for 10 of 100.
+
+    Its last time, 0, is left out: there the student returns its input, by the boundary condition.
+    """
+    if num_solver_steps < 2:
+        raise ConfigError("timestep_spacing 'leading' needs num_solver_steps of at least 2")
+    return torch.arange(1, num_solver_steps) * (num_train_timesteps // num_solver_steps)
+
+
+def solver_timesteps(
+    num_train_timesteps: int = 100, num_solver_steps: int = 10, timestep_spacing: str = "trailing"
+) -> Tensor:
+    """Return the ascending grid (int64) of times on which a student is trained; see `SPACINGS`.
 
     Raises ConfigError unless the second number divides the first.
     """
@@ -53,23 +79,19 @@ def solver_timesteps(num_train_timesteps: int = 100, num_solver_steps: int = 10)
         raise ConfigError(
             f"num_solver_steps={num_solver_steps} must divide num_train_timesteps={num_train_timesteps}: try 10 of 100"
         )
-    skip = num_train_timesteps // num_solver_steps
-    return torch.arange(1, num_solver_steps + 1) * skip - 1
+    return SPACINGS.get(timestep_spacing)(num_train_timesteps, num_solver_steps)
 
 
-def ddim_solver_step_corrected(x_t: Tensor, x0: Tensor, alpha_bar: Tensor, alpha_bar_prev: Tensor) -> Tensor:
+def ddim_step(guess: Guess, alpha_bar_prev: Tensor) -> Tensor:
     """Return x at the previous time of the path by DDIM (Song et al. 2021, equation 12, sigma = 0).
 
-    x_prev = sqrt(abar_prev) x0 + sqrt(1 - abar_prev) epsilon, with the epsilon that x_t and x0 imply.
+    x_prev = sqrt(abar_prev) x0 + sqrt(1 - abar_prev) epsilon.
 
     Args:
-        x_t: (B, ...) noisy actions.
-        x0: (B, ...) the teacher's clean actions.
-        alpha_bar: broadcastable, at the time of x_t.
+        guess: the teacher's clean actions and noise, each (B, ...).
         alpha_bar_prev: broadcastable, at the time gone to.
     """
-    epsilon = epsilon_from_x0(x_t, x0, alpha_bar)
-    return alpha_bar_prev.sqrt() * x0 + (1 - alpha_bar_prev).sqrt() * epsilon
+    return alpha_bar_prev.sqrt() * guess.x0 + (1 - alpha_bar_prev).sqrt() * guess.epsilon
 
 
 def public_solver_step(x0: Tensor, alpha_bar_prev: Tensor) -> Tensor:
@@ -77,91 +99,101 @@ def public_solver_step(x0: Tensor, alpha_bar_prev: Tensor) -> Tensor:
 
     There the network's clean action goes where the solver expects noise, so that
     x_prev = (sqrt(abar_prev) + sqrt(1 - abar_prev)) x0: x_t has no part in it, and the path collapses
-    onto the teacher's mean guess. Arguments as those of `ddim_solver_step_corrected`.
+    onto the teacher's mean guess. `alpha_bar_prev` as for `ddim_step`.
     """
     return (alpha_bar_prev.sqrt() + (1 - alpha_bar_prev).sqrt()) * x0
 
 
 class ConsistencySolver(ABC):
-    """One step back along the teacher's path, on the grid of `solver_timesteps`.
+    """One step back along the teacher's path, on the grid of `solver_timesteps`, which has N points.
 
     Args:
         alphas_cumprod: (T,) cumulative products of the alphas.
-        num_solver_steps: K, points of the grid.
+        num_solver_steps: K, steps of the grid.
         final_alpha_bar: alpha_bar at the end of the path, where the first grid point steps to.
+        timestep_spacing: of the grid, a name in `SPACINGS`.
 
     Attributes:
-        timesteps: (K,) int64, ascending.
-        timesteps_prev: (K,) int64, where each grid point steps to; 0 for the first.
-        alpha_bar: (K,) at `timesteps`.
-        alpha_bar_prev: (K,) at `timesteps_prev`, but `final_alpha_bar` for the first.
+        timesteps: (N,) int64, ascending.
+        timesteps_prev: (N,) int64, where each grid point steps to; 0 for the first.
+        alpha_bar: (N,) at `timesteps`.
+        alpha_bar_prev: (N,) at `timesteps_prev`, but `final_alpha_bar` for the first.
     """
 
-    def __init__(self, alphas_cumprod: Tensor, num_solver_steps: int, final_alpha_bar: float) -> None:
-        grid = solver_timesteps(len(alphas_cumprod), num_solver_steps).to(alphas_cumprod.device)
+    def __init__(
+        self, alphas_cumprod: Tensor, num_solver_steps: int, final_alpha_bar: float, timestep_spacing: str
+    ) -> None:
+        grid = solver_timesteps(len(alphas_cumprod), num_solver_steps, timestep_spacing).to(alphas_cumprod.device)
         self.timesteps = grid
         self.timesteps_prev = torch.cat([torch.zeros_like(grid[:1]), grid[:-1]])
         self.alpha_bar = alphas_cumprod[grid]
         self.alpha_bar_prev = torch.cat([torch.full_like(self.alpha_bar[:1], final_alpha_bar), self.alpha_bar[:-1]])
 
     def __len__(self) -> int:
-        """Return K, the number of grid points."""
+        """Return N, the number of grid points."""
         return len(self.timesteps)
 
     @abstractmethod
-    def previous(self, x_t: Tensor, x0: Tensor, index: Tensor) -> Tensor:
-        """Return x at the previous grid point.
+    def previous(self, guess: Guess, index: Tensor) -> Tensor:
+        """Return x (B, ...) at the previous grid point.
 
         Args:
-            x_t: (B, ...) at times `timesteps[index]`.
-            x0: (B, ...) the teacher's clean actions there.
-            index: (B,) int64 in [0, K).
+            guess: the teacher's x0 and epsilon, each (B, ...), at times `timesteps[index]`.
+            index: (B,) int64 in [0, N).
         """
 
 
 class CorrectedSolver(ConsistencySolver):
-    """DDIM with the noise implied by x0, ending at the clean action itself (alpha_bar = 1).
+    """DDIM with x0 and epsilon in their places, ending at the clean action itself (alpha_bar = 1).
 
     Both depart from the public code: the first keeps the modes of a multimodal action apart, the second
     removes noise of standard deviation sqrt(1 - alphas_cumprod[0]) (about 0.025) from the targets.
     """
 
-    def __init__(self, alphas_cumprod: Tensor, num_solver_steps: int = 10, final_alpha_bar: float = 1.0) -> None:
-        super().__init__(alphas_cumprod, num_solver_steps, final_alpha_bar)
+    def __init__(
+        self,
+        alphas_cumprod: Tensor,
+        num_solver_steps: int = 10,
+        final_alpha_bar: float = 1.0,
+        timestep_spacing: str = "trailing",
+    ) -> None:
+        super().__init__(alphas_cumprod, num_solver_steps, final_alpha_bar, timestep_spacing)
 
-    def previous(self, x_t: Tensor, x0: Tensor, index: Tensor) -> Tensor:
-        """Return x at the previous grid point; see `ddim_solver_step_corrected`."""
-        return ddim_solver_step_corrected(
-            x_t, x0, _per_row(self.alpha_bar, index, x_t), _per_row(self.alpha_bar_prev, index, x_t)
-        )
+    def previous(self, guess: Guess, index: Tensor) -> Tensor:
+        """Return x at the previous grid point; see `ddim_step`."""
+        return ddim_step(guess, _per_row(self.alpha_bar_prev, index, guess.x0))
 
 
 class PublicSolver(ConsistencySolver):
     """The public ManiCM code's step, kept for comparison; it ends at alphas_cumprod[0], as that code does."""
 
     def __init__(
-        self, alphas_cumprod: Tensor, num_solver_steps: int = 10, final_alpha_bar: float | None = None
+        self,
+        alphas_cumprod: Tensor,
+        num_solver_steps: int = 10,
+        final_alpha_bar: float | None = None,
+        timestep_spacing: str = "trailing",
     ) -> None:
         final = float(alphas_cumprod[0]) if final_alpha_bar is None else final_alpha_bar
-        super().__init__(alphas_cumprod, num_solver_steps, final)
+        super().__init__(alphas_cumprod, num_solver_steps, final, timestep_spacing)
 
-    def previous(self, x_t: Tensor, x0: Tensor, index: Tensor) -> Tensor:
+    def previous(self, guess: Guess, index: Tensor) -> Tensor:
         """Return x at the previous grid point; see `public_solver_step`."""
-        return public_solver_step(x0, _per_row(self.alpha_bar_prev, index, x_t))
+        return public_solver_step(guess.x0, _per_row(self.alpha_bar_prev, index, guess.x0))
 
 
 def consistency_pair(
-    solver: ConsistencySolver, teacher: Denoise, online: Denoise, target: Denoise, x_t: Tensor, index: Tensor
+    solver: ConsistencySolver, teacher: Teach, online: Denoise, target: Denoise, x_t: Tensor, index: Tensor
 ) -> tuple[Tensor, Tensor]:
     """Return the two clean actions that consistency distillation makes agree (ManiCM, equation 3).
 
     Args:
         solver: grid and step back.
-        teacher: the frozen teacher's x0.
+        teacher: the frozen teacher's x0 and epsilon.
         online: the student f being trained, boundary scalings included.
         target: its moving average, boundary scalings included.
         x_t: (B, ...) demonstrated actions with noise of times `solver.timesteps[index]` added.
-        index: (B,) int64 in [0, K).
+        index: (B,) int64 in [0, N).
 
     Returns:
         f(x_t, t), with gradient, and the target's f(x_prev, t_prev), without; each (B, ...).
@@ -169,7 +201,7 @@ def consistency_pair(
     t, t_prev = solver.timesteps[index], solver.timesteps_prev[index]
     prediction = online(x_t, t)
     with torch.no_grad():
-        x_prev = solver.previous(x_t, teacher(x_t, t), index)
+        x_prev = solver.previous(teacher(x_t, t), index)
         wanted = target(x_prev, t_prev)
     return prediction, wanted
 

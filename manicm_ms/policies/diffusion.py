@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass
-from typing import Any, Protocol
+from typing import Any, ClassVar, NamedTuple, Protocol
 
 import torch
 from diffusers.schedulers.scheduling_ddim import DDIMScheduler
@@ -40,14 +40,40 @@ def x0_from_epsilon(x_t: Tensor, epsilon: Tensor, alpha_bar: Tensor) -> Tensor:
     return (x_t - (1 - alpha_bar).sqrt() * epsilon) / alpha_bar.sqrt()
 
 
+class Guess(NamedTuple):
+    """What a network takes a noisy action to be made of.
+
+    Attributes:
+        x0: (B, Tp, Da) clean actions, clipped where sampling clips.
+        epsilon: (B, Tp, Da) noise, of the network's output as it is: diffusers' DDIM steps along the noise of the
+            unclipped output, so that x0 and epsilon need not add up to x_t where clipping acts.
+    """
+
+    x0: Tensor
+    epsilon: Tensor
+
+
 class Prediction(Protocol):
-    """What the network's output means; all arrays are (B, Tp, Da), alpha_bar broadcasts to them."""
+    """What the network's output means; all arrays are (B, Tp, Da), alpha_bar broadcasts to them.
+
+    Attributes:
+        timestep_spacing: where a single evaluation, and a student, begin: "trailing" at the last time T - 1, "leading"
+            at the first time that the teacher's own sampler visits.
+    """
+
+    timestep_spacing: ClassVar[str]
 
     def target(self, x0: Tensor, epsilon: Tensor) -> Tensor:
         """Return what the network is trained to output."""
 
     def x0(self, output: Tensor, x_t: Tensor, alpha_bar: Tensor) -> Tensor:
         """Return the clean action that an output implies."""
+
+    def epsilon(self, output: Tensor, x_t: Tensor, alpha_bar: Tensor) -> Tensor:
+        """Return the noise that an output implies."""
+
+    def student_x0(self, x0: Tensor, limit: float) -> Tensor:
+        """Return the clean action as a student's loss sees it; in sampling it is clipped to [-limit, limit]."""
 
 
 PREDICTIONS: Registry[type[Prediction]] = Registry("prediction_type")
@@ -56,6 +82,8 @@ PREDICTIONS: Registry[type[Prediction]] = Registry("prediction_type")
 @PREDICTIONS.register("sample")
 class SamplePrediction:
     """The network outputs the clean action x0."""
+
+    timestep_spacing = "trailing"
 
     def target(self, x0: Tensor, epsilon: Tensor) -> Tensor:
         """Return `x0`."""
@@ -67,10 +95,25 @@ class SamplePrediction:
         del x_t, alpha_bar
         return output
 
+    def epsilon(self, output: Tensor, x_t: Tensor, alpha_bar: Tensor) -> Tensor:
+        """Return the noise; see `epsilon_from_x0`."""
+        return epsilon_from_x0(x_t, output, alpha_bar)
+
+    def student_x0(self, x0: Tensor, limit: float) -> Tensor:
+        """Return `x0` as it is: nothing multiplies the network's error, and its targets lie within the limit."""
+        del limit
+        return x0
+
 
 @PREDICTIONS.register("epsilon")
 class EpsilonPrediction:
-    """The network outputs the noise epsilon."""
+    """The network outputs the noise epsilon.
+
+    In x0 its error is multiplied by sqrt((1 - abar) / abar): 2029 at the last of 100 times, where no network is
+    accurate enough to say anything about x0, and 7.1 at time 90, where the sampler of ten steps begins.
+    """
+
+    timestep_spacing = "leading"
 
     def target(self, x0: Tensor, epsilon: Tensor) -> Tensor:
         """Return `epsilon`."""
@@ -80,6 +123,19 @@ class EpsilonPrediction:
     def x0(self, output: Tensor, x_t: Tensor, alpha_bar: Tensor) -> Tensor:
         """Return the clean action; see `x0_from_epsilon`."""
         return x0_from_epsilon(x_t, output, alpha_bar)
+
+    def epsilon(self, output: Tensor, x_t: Tensor, alpha_bar: Tensor) -> Tensor:
+        """Return `output`."""
+        del x_t, alpha_bar
+        return output
+
+    def student_x0(self, x0: Tensor, limit: float) -> Tensor:
+        """Return `x0` clipped as in sampling, with the gradient of the unclipped one.
+
+        A plain clip has no gradient beyond the limit, which is where a wrong epsilon puts x0, so that it could never be
+        corrected (Bengio et al. 2013, straight-through estimator).
+        """
+        return x0.clamp(-limit, limit).detach() + (x0 - x0.detach())
 
 
 @dataclass(frozen=True)
@@ -189,9 +245,21 @@ class DiffusionPolicy(Policy):
         Returns:
             (B, Tp, Da) normalised, within the clipping range.
         """
-        output = self.network.denoise(x_t, t, cond).float()
-        x0 = self.prediction.x0(output, x_t, self.alphas_cumprod[t][:, None, None])
-        return x0.clamp(-self.diffusion.clip_range, self.diffusion.clip_range)
+        return self.guess(x_t, t, cond).x0
+
+    def guess(self, x_t: Tensor, t: Tensor, cond: Tensor) -> Guess:
+        """Return the clean chunk and the noise with which `sample` takes its step; arguments as for `predict_x0`."""
+        output, limit = self.network.denoise(x_t, t, cond).float(), self.diffusion.clip_range
+        alpha_bar = self.alphas_cumprod[t][:, None, None]
+        x0 = self.prediction.x0(output, x_t, alpha_bar)
+        return Guess(x0.clamp(-limit, limit), self.prediction.epsilon(output, x_t, alpha_bar))
+
+    @property
+    def first_time(self) -> int:
+        """Time at which a single evaluation reads pure noise; see `Prediction.timestep_spacing`."""
+        if self.prediction.timestep_spacing == "trailing":
+            return self.diffusion.num_train_timesteps - 1
+        return int(self._sampler(self.diffusion.num_inference_steps).timesteps[0])
 
     def sample(self, cond: Tensor, noise: Tensor, num_inference_steps: int | None = None) -> Tensor:
         """Return a normalised chunk (B, Tp, Da) denoised from `noise` (B, Tp, Da) by DDIM without added noise."""
@@ -227,7 +295,7 @@ class OneStepTeacher(Policy):
     """The control for distillation: the undistilled teacher's own guess at x0 from pure noise, in one evaluation.
 
     Args:
-        teacher: the policy that is run at its last training time only; its weights are shared.
+        teacher: the policy that is run at its `first_time` only; its weights are shared.
     """
 
     registered = False
@@ -267,7 +335,7 @@ class OneStepTeacher(Policy):
         """Choose the next actions; see `Policy.act`."""
         batch = check_obs(obs, self.spec, self.chunk)
         (start,) = starting_noise(self, batch, generator, noise)
-        last = torch.full((batch,), self.teacher.diffusion.num_train_timesteps - 1, device=start.device)
+        last = torch.full((batch,), self.teacher.first_time, device=start.device)
         return executed_actions(self, self.teacher.predict_x0(start, last, self.network.encode_acting(obs, start)))
 
 

@@ -7,8 +7,8 @@ from collections.abc import Mapping
 from dataclasses import asdict, dataclass
 from typing import Any
 
+import numpy as np
 import torch
-from diffusers.schedulers.scheduling_lcm import LCMScheduler
 from torch import Tensor
 
 from manicm_ms.errors import ConfigError
@@ -21,7 +21,13 @@ from manicm_ms.policies.base import (
     starting_noise,
     updated_config,
 )
-from manicm_ms.policies.consistency import SIGMA_DATA, TIMESTEP_SCALING, boundary_scalings, solver_timesteps
+from manicm_ms.policies.consistency import (
+    SIGMA_DATA,
+    SPACINGS,
+    TIMESTEP_SCALING,
+    boundary_scalings,
+    solver_timesteps,
+)
 from manicm_ms.policies.denoiser import ConditionedDenoiser, NetworkConfig
 from manicm_ms.policies.diffusion import PREDICTIONS, DiffusionConfig, DiffusionPolicy, Prediction, executed_actions
 from manicm_ms.policies.normalizer import Normalizer
@@ -34,18 +40,22 @@ class ConsistencyConfig:
 
     Attributes:
         nfe: network evaluations of one decision; 1 in the paper's main result, 4 in its variant.
-        num_solver_steps: K, times on which the student is trained, spread evenly over the noising process.
-            Sampling visits only these: other times were never seen in training.
+        num_solver_steps: K, steps of the grid of times on which the student is trained, spread evenly over the noising
+            process. Sampling visits only these times: others were never seen in training.
+        timestep_spacing: of that grid, a name in `SPACINGS`: "trailing" begins at T - 1, "leading" where the teacher's
+            own sampler begins. A teacher that predicts epsilon needs "leading"; see `EpsilonPrediction`.
         sigma_data: balance value of the boundary scalings.
         timestep_scaling: beta of the boundary scalings.
     """
 
     nfe: int = 1
     num_solver_steps: int = 10
+    timestep_spacing: str = "trailing"
     sigma_data: float = SIGMA_DATA
     timestep_scaling: float = TIMESTEP_SCALING
 
     def __post_init__(self) -> None:
+        SPACINGS.get(self.timestep_spacing)
         if not 1 <= self.nfe <= self.num_solver_steps:
             raise ConfigError(f"nfe={self.nfe} must lie between 1 and num_solver_steps={self.num_solver_steps}")
 
@@ -53,8 +63,9 @@ class ConsistencyConfig:
 class ManiCM(Policy):
     """Maps noise to an action chunk by a consistency function f(x_t, t) = c_skip x_t + c_out F(x_t, t).
 
-    With nfe = 1, x0 = f(noise, T - 1). With more, noise is added to x0 again at the next lower time of the
-    latent-consistency schedule (99, 79, 49, 29 for 4 of 10 steps over T = 100) and f is applied anew.
+    With nfe = 1, x0 = f(noise, last time of the grid), which is T - 1 for a student of a "sample" teacher. With more,
+    noise is added to x0 again at the next lower time of the latent-consistency schedule (99, 79, 49, 29 for 4 of 10
+    steps over T = 100) and f is applied anew.
 
     Args:
         network: encoder, U-Net and normaliser.
@@ -94,8 +105,10 @@ class ManiCM(Policy):
         Args:
             teacher: a trained policy, left untouched.
             nfe: network evaluations of one decision.
-            **consistency: further fields of `ConsistencyConfig`.
+            **consistency: further fields of `ConsistencyConfig`; `timestep_spacing` is by default what suits the
+                teacher's prediction.
         """
+        consistency.setdefault("timestep_spacing", teacher.prediction.timestep_spacing)
         return cls(
             copy.deepcopy(teacher.network),
             teacher.spec,
@@ -137,7 +150,7 @@ class ManiCM(Policy):
         self.network.normalizer.fit(stats)
 
     def consistency_function(self, x_t: Tensor, t: Tensor, cond: Tensor) -> Tensor:
-        """Return f(x_t, t), as it is trained: not clipped.
+        """Return f(x_t, t), as it is trained; whether x0 is clipped there, `Prediction.student_x0` says.
 
         Args:
             x_t: (B, Tp, Da) normalised noisy actions.
@@ -148,7 +161,8 @@ class ManiCM(Policy):
             (B, Tp, Da) normalised clean actions.
         """
         c_skip, c_out = self._scalings(t)
-        return c_skip * x_t + c_out * self._network_x0(x_t, t, cond)
+        x0 = self.prediction.student_x0(self._network_x0(x_t, t, cond), self.diffusion.clip_range)
+        return c_skip * x_t + c_out * x0
 
     def sample(self, cond: Tensor, noise: tuple[Tensor, ...]) -> Tensor:
         """Return a normalised chunk (B, Tp, Da) from `nfe` arrays of noise (B, Tp, Da).
@@ -186,19 +200,16 @@ class ManiCM(Policy):
 
 
 def lcm_timesteps(diffusion: DiffusionConfig, consistency: ConsistencyConfig) -> tuple[int, ...]:
-    """Return the times that sampling visits, descending; all of them lie on the grid of training.
+    """Return the times that sampling visits, descending: every so many-th of the grid of training, from its end.
 
-    diffusers is told `original_inference_steps`: its default of 50 would lead to times never trained on.
+    On the trailing grid they are those of diffusers' `LCMScheduler` with `original_inference_steps` = K; its default
+    of 50 would lead to times never trained on.
     """
-    grid = solver_timesteps(diffusion.num_train_timesteps, consistency.num_solver_steps).tolist()
-    scheduler = LCMScheduler(
-        num_train_timesteps=diffusion.num_train_timesteps, original_inference_steps=consistency.num_solver_steps
-    )
-    scheduler.set_timesteps(consistency.nfe, original_inference_steps=consistency.num_solver_steps)
-    times = tuple(scheduler.timesteps.tolist())
-    if not set(times) <= set(grid):
-        raise ConfigError(f"sampling would visit the times {times}, training only {tuple(grid)}")
-    return times
+    grid = solver_timesteps(diffusion.num_train_timesteps, consistency.num_solver_steps, consistency.timestep_spacing)
+    if consistency.nfe > len(grid):
+        raise ConfigError(f"nfe={consistency.nfe} exceeds the {len(grid)} times of training: {grid.tolist()}")
+    places = np.floor(np.linspace(0, len(grid), consistency.nfe, endpoint=False)).astype(int)
+    return tuple(grid.flip(0)[places.tolist()].tolist())
 
 
 @POLICIES.register("manicm", tags=("student",))

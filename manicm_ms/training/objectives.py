@@ -12,7 +12,7 @@ from torch.nn.functional import mse_loss
 
 from manicm_ms.policies.base import Policy
 from manicm_ms.policies.consistency import ConsistencySolver, CorrectedSolver, PublicSolver, consistency_pair
-from manicm_ms.policies.diffusion import DiffusionPolicy
+from manicm_ms.policies.diffusion import DiffusionPolicy, Guess
 from manicm_ms.policies.manicm import ManiCM
 from manicm_ms.registry import Registry
 from manicm_ms.training.features import CLEAN_ACTION, COND, draw_points
@@ -95,8 +95,8 @@ class Distillation(PolicyObjective):
         """Return the grid of times and the step back along the teacher's path."""
 
     @abstractmethod
-    def teacher_x0(self, x_t: Tensor, t: Tensor, cond: Tensor) -> Tensor:
-        """Return the clean actions (B, Tp, Da) that lead the solver, for x_t (B, Tp, Da), t (B,), cond (B, F)."""
+    def teach(self, x_t: Tensor, t: Tensor, cond: Tensor) -> Guess:
+        """Return what leads the solver, each (B, Tp, Da), for x_t (B, Tp, Da), t (B,), cond (B, F)."""
 
     def forward(self, batch: Mapping[str, Tensor], generator: torch.Generator) -> Tensor:
         """Return the loss of a batch of `FeatureWindows`."""
@@ -109,7 +109,7 @@ class Distillation(PolicyObjective):
         epsilon = torch.randn(x0.shape, generator=generator, device=device)
         prediction, wanted = consistency_pair(
             solver,
-            teacher=lambda x_t, t: self.teacher_x0(x_t, t, cond),
+            teacher=lambda x_t, t: self.teach(x_t, t, cond),
             online=lambda x_t, t: self.student.consistency_function(x_t, t, cond),
             target=lambda x_t, t: follower.consistency_function(x_t, t, cond),
             x_t=self.teacher.add_noise(x0, epsilon, solver.timesteps[index]),
@@ -132,15 +132,18 @@ DISTILLATIONS: Registry[type[Distillation]] = Registry("distillation objective")
 
 @DISTILLATIONS.register("consistency")
 class ConsistencyDistillation(Distillation):
-    """Distillation along the DDIM path of the teacher's clipped x0, down to the clean action itself."""
+    """Distillation along the path of the teacher's own DDIM step, down to the clean action itself."""
 
     def solver(self) -> ConsistencySolver:
-        """Return DDIM with the noise that x0 implies, ending at alpha_bar = 1."""
-        return CorrectedSolver(self.student.alphas_cumprod, self.student.consistency.num_solver_steps)
+        """Return DDIM, ending at alpha_bar = 1."""
+        config = self.student.consistency
+        return CorrectedSolver(
+            self.student.alphas_cumprod, config.num_solver_steps, timestep_spacing=config.timestep_spacing
+        )
 
-    def teacher_x0(self, x_t: Tensor, t: Tensor, cond: Tensor) -> Tensor:
-        """Return the teacher's x0, clipped as in its sampling."""
-        return self.teacher.predict_x0(x_t, t, cond)
+    def teach(self, x_t: Tensor, t: Tensor, cond: Tensor) -> Guess:
+        """Return the teacher's x0, clipped, and the epsilon of its unclipped output, as in its sampling."""
+        return self.teacher.guess(x_t, t, cond)
 
 
 @DISTILLATIONS.register("public-consistency")
@@ -153,9 +156,13 @@ class PublicConsistencyDistillation(Distillation):
 
     def solver(self) -> ConsistencySolver:
         """Return the public code's step."""
-        return PublicSolver(self.student.alphas_cumprod, self.student.consistency.num_solver_steps)
+        config = self.student.consistency
+        return PublicSolver(
+            self.student.alphas_cumprod, config.num_solver_steps, timestep_spacing=config.timestep_spacing
+        )
 
-    def teacher_x0(self, x_t: Tensor, t: Tensor, cond: Tensor) -> Tensor:
-        """Return the teacher's x0 as the network gives it."""
-        output = self.teacher.network.denoise(x_t, t, cond).float()
-        return self.teacher.prediction.x0(output, x_t, self.teacher.alphas_cumprod[t][:, None, None])
+    def teach(self, x_t: Tensor, t: Tensor, cond: Tensor) -> Guess:
+        """Return the teacher's x0 as the network gives it, and its epsilon, which this solver does not use."""
+        output, prediction = self.teacher.network.denoise(x_t, t, cond).float(), self.teacher.prediction
+        alpha_bar = self.teacher.alphas_cumprod[t][:, None, None]
+        return Guess(prediction.x0(output, x_t, alpha_bar), prediction.epsilon(output, x_t, alpha_bar))

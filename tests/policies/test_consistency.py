@@ -8,10 +8,10 @@ from manicm_ms.policies.consistency import (
     PublicSolver,
     boundary_scalings,
     consistency_pair,
-    ddim_solver_step_corrected,
+    ddim_step,
     solver_timesteps,
 )
-from manicm_ms.policies.diffusion import DiffusionConfig
+from manicm_ms.policies.diffusion import DiffusionConfig, Guess, epsilon_from_x0
 
 ABAR = DiffusionConfig().ddpm().alphas_cumprod
 
@@ -48,20 +48,30 @@ def test_grid_ends_at_the_noisiest_time():
         solver_timesteps(100, 7)
 
 
+def test_leading_grid_holds_the_times_of_the_teacher_s_sampler_but_for_zero():
+    sampler = DiffusionConfig().ddim(10).timesteps.tolist()
+    assert solver_timesteps(100, 10, "leading").flip(0).tolist() == [t for t in sampler if t > 0]
+    solver = CorrectedSolver(ABAR, timestep_spacing="leading")
+    assert solver.timesteps_prev.tolist() == [0, *range(10, 90, 10)]
+    assert solver.alpha_bar_prev[0] == 1.0
+    with pytest.raises(ConfigError, match="at least 2"):
+        solver_timesteps(100, 1, "leading")
+
+
 def test_the_step_moves_along_the_path_of_a_known_noise():
     x0, epsilon, index = points()
     solver = CorrectedSolver(ABAR)
     x_t = noisy(x0, epsilon, solver.alpha_bar[index])
     expected = noisy(x0, epsilon, solver.alpha_bar_prev[index])
-    torch.testing.assert_close(solver.previous(x_t, x0, index), expected, rtol=1e-4, atol=1e-4)
+    guess = Guess(x0, epsilon_from_x0(x_t, x0, solver.alpha_bar[index][:, None, None]))
+    torch.testing.assert_close(solver.previous(guess, index), expected, rtol=1e-4, atol=1e-4)
 
 
 def test_the_first_grid_point_steps_to_the_clean_action():
     x0, epsilon, index = points()
     solver = CorrectedSolver(ABAR)
-    x_t = noisy(x0, epsilon, solver.alpha_bar[index])
     assert solver.timesteps_prev[0] == 0
-    torch.testing.assert_close(solver.previous(x_t, x0, index)[:1], x0[:1], rtol=0, atol=0)
+    torch.testing.assert_close(solver.previous(Guess(x0, epsilon), index)[:1], x0[:1], rtol=0, atol=0)
 
 
 def test_the_step_is_diffusers_ddim_on_trailing_times():
@@ -76,30 +86,34 @@ def test_the_step_is_diffusers_ddim_on_trailing_times():
     scheduler.set_timesteps(10)
     assert scheduler.timesteps.tolist() == solver_timesteps(100, 10).flip(0).tolist()
     x_t, x0, index = points(seed=3)
-    got = CorrectedSolver(ABAR).previous(x_t, x0, index)
+    solver = CorrectedSolver(ABAR)
+    epsilon = epsilon_from_x0(x_t, x0, solver.alpha_bar[index][:, None, None])
+    got = solver.previous(Guess(x0, epsilon), index)
     for row in range(10):
         expected = scheduler.step(x0[row], int(scheduler.timesteps[9 - index[row]]), x_t[row]).prev_sample
         torch.testing.assert_close(got[row], expected, rtol=1e-5, atol=1e-5)
 
 
 def test_the_public_step_is_the_same_formula_with_the_action_in_place_of_the_noise():
-    x_t, x0, index = points()
+    x0, epsilon, index = points()
     solver = PublicSolver(ABAR)
     a = solver.alpha_bar_prev[index][:, None, None]
-    torch.testing.assert_close(solver.previous(x_t, x0, index), a.sqrt() * x0 + (1 - a).sqrt() * x0)
+    torch.testing.assert_close(solver.previous(Guess(x0, epsilon), index), a.sqrt() * x0 + (1 - a).sqrt() * x0)
     assert solver.alpha_bar_prev[0] == ABAR[0]
-    torch.testing.assert_close(solver.previous(x_t, x0, index), solver.previous(x_t + 1, x0, index))
-    corrected = CorrectedSolver(ABAR).previous(x_t, x0, index)
-    assert (corrected - solver.previous(x_t, x0, index))[1:].abs().amax((1, 2)).min() > 0.1
+    public = solver.previous(Guess(x0, epsilon), index)
+    torch.testing.assert_close(public, solver.previous(Guess(x0, epsilon + 1), index))
+    corrected = CorrectedSolver(ABAR).previous(Guess(x0, epsilon), index)
+    assert (corrected - public)[1:].abs().amax((1, 2)).min() > 0.1
 
 
 def test_one_long_step_equals_two_short_ones_while_the_guess_stays():
     x_t, x0, _ = points()
     a, b, c = (torch.tensor(v) for v in (0.1, 0.5, 0.9))
-    middle = ddim_solver_step_corrected(x_t, x0, a, b)
-    torch.testing.assert_close(
-        ddim_solver_step_corrected(middle, x0, b, c), ddim_solver_step_corrected(x_t, x0, a, c), rtol=1e-4, atol=1e-4
-    )
+
+    def step(x, source, target):
+        return ddim_step(Guess(x0, epsilon_from_x0(x, x0, source)), target)
+
+    torch.testing.assert_close(step(step(x_t, a, b), b, c), step(x_t, a, c), rtol=1e-4, atol=1e-4)
 
 
 def test_the_pair_compares_both_ends_of_the_step_and_only_one_has_a_gradient():
@@ -115,10 +129,11 @@ def test_the_pair_compares_both_ends_of_the_step_and_only_one_has_a_gradient():
 
         return f
 
-    prediction, wanted = consistency_pair(solver, lambda x, t: x0, student("online"), student("target"), x_t, index)
+    guess = Guess(x0, epsilon)
+    prediction, wanted = consistency_pair(solver, lambda x, t: guess, student("online"), student("target"), x_t, index)
     assert torch.equal(seen["online"][1], solver.timesteps[index])
     assert torch.equal(seen["target"][1], solver.timesteps_prev[index])
-    torch.testing.assert_close(seen["target"][0], solver.previous(x_t, x0, index))
+    torch.testing.assert_close(seen["target"][0], solver.previous(guess, index))
     assert prediction.requires_grad
     assert not wanted.requires_grad
 
@@ -133,5 +148,5 @@ def test_an_exactly_consistent_student_has_no_loss():
     def exact(x, t):
         return torch.where(t[:, None, None] == 0, x, a)
 
-    prediction, wanted = consistency_pair(solver, lambda x, t: a, exact, exact, x_t, index)
+    prediction, wanted = consistency_pair(solver, lambda x, t: Guess(a, epsilon), exact, exact, x_t, index)
     torch.testing.assert_close(prediction, wanted, rtol=0, atol=1e-6)

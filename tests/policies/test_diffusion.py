@@ -6,6 +6,7 @@ from policy_specs import CHUNK, TINY, make_obs, make_spec, wobble
 from manicm_ms.demos.stats import FieldStats
 from manicm_ms.errors import ConfigError
 from manicm_ms.policies.base import make_policy
+from manicm_ms.policies.consistency import CorrectedSolver
 from manicm_ms.policies.diffusion import (
     PREDICTIONS,
     DiffusionConfig,
@@ -154,6 +155,55 @@ def test_the_control_asks_the_teacher_once_at_its_last_time():
     with torch.no_grad():
         x0 = policy.network.denoise(noise, torch.tensor([99, 99]), policy.network.encode(obs))
     torch.testing.assert_close(action, x0[:, 1:4].clamp(-1, 1))  # the identity normaliser
+
+
+def test_the_control_of_an_epsilon_teacher_reads_noise_where_the_sampler_begins():
+    """At time 99 its error would be multiplied by 2029, and every action would lie on a limit."""
+    policy = teacher("epsilon")
+    counted, control = Counted(policy.network), OneStepTeacher(policy)
+    obs, noise = make_obs(policy.spec, 2), torch.randn(2, 4, 3)
+    action = control.act(obs, noise=noise)
+    assert counted.times == [[90, 90]]
+    a = diffusers_process().alphas_cumprod[90]
+    with torch.no_grad():
+        output = policy.network.denoise(noise, torch.tensor([90, 90]), policy.network.encode(obs))
+    x0 = (noise - (1 - a).sqrt() * output) / a.sqrt()
+    torch.testing.assert_close(action, x0[:, 1:4].clamp(-1, 1), rtol=1e-4, atol=1e-4)
+
+
+@pytest.mark.parametrize("prediction_type", ["sample", "epsilon"])
+@pytest.mark.parametrize("spacing", ["leading", "trailing"])
+def test_the_distilled_path_is_the_sampled_path_where_clipping_acts(prediction_type, spacing):
+    """Diffusers' DDIM step with the network's outputs, several times the limit: x0 is clipped, epsilon is not."""
+    policy = teacher(prediction_type)
+    last = policy.network.unet.head[-1]
+    with torch.no_grad():
+        last.weight.mul_(4.0)
+        last.bias.mul_(4.0)
+    scheduler = DDIMScheduler(
+        num_train_timesteps=100,
+        beta_schedule="squaredcos_cap_v2",
+        prediction_type=prediction_type,
+        clip_sample=True,
+        set_alpha_to_one=True,
+        timestep_spacing=spacing,
+    )
+    scheduler.set_timesteps(10)
+    solver = CorrectedSolver(policy.alphas_cumprod, timestep_spacing=spacing)
+    cond = policy.network.encode(make_obs(policy.spec, 5))
+    x, beyond = torch.randn(5, 4, 3, generator=torch.Generator().manual_seed(3)), 0
+    with torch.no_grad():
+        for index in reversed(range(len(solver))):
+            t = solver.timesteps[index].repeat(5)
+            output = policy.network.denoise(x, t, cond)
+            step = scheduler.step(output, int(t[0]), x)
+            beyond += int((step.pred_original_sample.abs() == 1).sum())
+            got = solver.previous(policy.guess(x, t, cond), torch.full((5,), index))
+            # from time 10 the leading grid goes to the clean action, diffusers to time 0
+            expected = step.pred_original_sample if index == 0 else step.prev_sample
+            torch.testing.assert_close(got, expected, rtol=1e-6, atol=1e-6)
+            x = got
+    assert beyond > 20
 
 
 @pytest.mark.parametrize("wrap", [lambda p: p, OneStepTeacher])

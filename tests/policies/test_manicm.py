@@ -8,11 +8,11 @@ from manicm_ms.policies.base import POLICIES, make_policy
 from manicm_ms.policies.manicm import ManiCM
 
 
-def student(nfe=1, prediction_type="sample"):
+def student(nfe=1, prediction_type="sample", **consistency):
     config = TINY | {"diffusion": {"prediction_type": prediction_type}}
     teacher = make_policy("simple_dp3", make_spec(), CHUNK, config, seed=0)
     wobble(teacher.network.unet)
-    return ManiCM.from_teacher(teacher, nfe=nfe)
+    return ManiCM.from_teacher(teacher, nfe=nfe, **consistency)
 
 
 def test_starts_from_a_copy_of_the_teacher():
@@ -40,10 +40,46 @@ def test_sampling_visits_only_times_of_training(nfe, times):
     assert student(nfe).nfe == student(nfe).noise_draws == nfe
 
 
+@pytest.mark.parametrize("nfe", range(1, 11))
+def test_times_are_those_of_diffusers_lcm(nfe):
+    scheduler = LCMScheduler(num_train_timesteps=100, original_inference_steps=10)
+    scheduler.set_timesteps(nfe, original_inference_steps=10)
+    assert student(nfe).timesteps == tuple(scheduler.timesteps.tolist())
+
+
+def test_student_of_an_epsilon_teacher_starts_where_the_teacher_s_sampler_does():
+    assert student(1, "epsilon").timesteps == (90,)
+    assert student(4, "epsilon").timesteps == (90, 70, 50, 30)
+    with pytest.raises(ConfigError, match="exceeds the 9 times"):
+        student(10, "epsilon")
+
+
+def test_a_student_from_before_the_spacing_acts_as_it_did():
+    policy = student(prediction_type="epsilon", timestep_spacing="trailing")
+    config = policy.config_dict()
+    config["consistency"].pop("timestep_spacing")
+    assert make_policy("manicm", policy.spec, CHUNK, config).timesteps == (99,)
+
+
+@pytest.mark.parametrize("t", [10, 90])
+def test_epsilon_student_is_trained_on_the_clipped_x0_with_the_gradient_of_the_unclipped(t):
+    """Doubling the noise sends x0 far beyond the limit; a plain clip would leave no way back."""
+    policy = student(prediction_type="epsilon")
+    x, epsilon = torch.randn(2, 3, 4, 3, generator=torch.Generator().manual_seed(0))
+    a, limit = policy.alphas_cumprod[t], 1.0
+    output = (2 * epsilon).requires_grad_()
+    raw = (x - (1 - a).sqrt() * output) / a.sqrt()
+    seen = policy.prediction.student_x0(raw, limit)
+    assert torch.equal(seen, raw.clamp(-limit, limit))
+    assert (raw.abs() > limit).any()
+    seen.sum().backward()
+    torch.testing.assert_close(output.grad, torch.full_like(output, -float(((1 - a) / a).sqrt())))
+
+
 @pytest.mark.parametrize("prediction_type", ["sample", "epsilon"])
 @pytest.mark.parametrize("nfe", [1, 4])
 def test_sampling_equals_diffusers_lcm(nfe, prediction_type):
-    policy = student(nfe, prediction_type)
+    policy = student(nfe, prediction_type, timestep_spacing="trailing")
     obs = make_obs(policy.spec, 5)
     scheduler = LCMScheduler(
         num_train_timesteps=100,

@@ -200,6 +200,7 @@ def test_epsilon_prediction_and_the_public_formula_train_too(pair, tmp_path):
         student, _ = run(distill, out, data, tmp_path / objective, replace(STUDENT, **FEW, objective=objective))
         obs, _ = unseen_cases(2)
         assert torch.isfinite(load_checkpoint(student).act(obs)).all()
+    assert read_manifest(tmp_path / "consistency")["provenance"]["final_loss"] < 1.0
 
 
 @pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a CUDA device")
