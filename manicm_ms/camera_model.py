@@ -5,6 +5,7 @@ from __future__ import annotations
 import difflib
 import json
 import math
+import warnings
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass, fields
 from functools import lru_cache
@@ -17,9 +18,11 @@ import yaml
 from numpy.typing import NDArray
 from torch import Tensor
 
-from manicm_ms.errors import CameraError
+from manicm_ms.camera_doubts import doubts
+from manicm_ms.errors import CameraError, CameraWarning
 from manicm_ms.paths import asset, write_text
 from manicm_ms.point_cloud import Box, crop_transformed, inside, sample_cloud, sample_cloud_batch, transform
+from manicm_ms.written_numbers import as_number, point_for_comma
 
 CLOUD_SIZE = (84, 84)
 """(H, W) of the picture that a depth image is resized to before it becomes points."""
@@ -82,11 +85,12 @@ class CameraModel:
         left, top, width, height = self.crop
         fits = min(left, top) >= 0 and min(width, height) >= 1
         fits = fits and left + width <= self.width and top + height <= self.height
+        of = ": of another size?"
         return [
             (min(self.width, self.height) >= 1, f"width and height must be 1 or more, got {self.width}, {self.height}"),
             (min(self.fx, self.fy) > 0, f"fx and fy must be above 0 pixels, got {self.fx}, {self.fy}"),
-            (0 <= self.cx < self.width, f"cx must lie in the image, 0 to {self.width - 1} pixels, got {self.cx}"),
-            (0 <= self.cy < self.height, f"cy must lie in the image, 0 to {self.height - 1} pixels, got {self.cy}"),
+            (0 <= self.cx < self.width, f"cx must lie in the image, 0 to {self.width - 1} pixels, got {self.cx}{of}"),
+            (0 <= self.cy < self.height, f"cy must lie in the image, 0 to {self.height - 1} pixels, got {self.cy}{of}"),
             (low <= self.depth_unit <= high, f"depth_unit must be {low:g} to {high:g} m, got {self.depth_unit:g}"),
             (fits, f"crop {tuple(self.crop)} (left, top, width, height) leaves the {self.width}x{self.height} image"),
             (is_rigid(self.T_base_camera), "T_base_camera must be a 4x4 rigid transform: a rotation matrix, "
@@ -236,6 +240,7 @@ _ACCEPTED = {
 }
 """Fields of a camera file, each with what it accepts."""
 _OPTIONAL = {"distortion", "name", "serial", "notes"}
+_NO_NUMBERS = {"model", "name", "serial", "notes"}
 
 
 def default_camera() -> CameraModel:
@@ -245,6 +250,11 @@ def default_camera() -> CameraModel:
 
 def read_camera(path: Path) -> CameraModel:
     """Read a camera file (YAML; docs/guides/real_camera.md describes it).
+
+    Numbers that YAML reads as text, as 1e-3, are read as numbers.
+
+    Warns:
+        CameraWarning: the numbers can hardly be those of one camera, as intrinsics of another resolution.
 
     Raises:
         CameraError: the file is missing, not YAML, of another camera model, or a field is missing, unknown or out of
@@ -257,9 +267,12 @@ def read_camera(path: Path) -> CameraModel:
     except (yaml.YAMLError, UnicodeDecodeError) as error:
         raise CameraError(f"{path} is not YAML: {' '.join(str(error).split())}") from error
     try:
-        return _camera_of(fields_)
+        camera = _camera_of(fields_)
     except CameraError as error:
         raise CameraError(f"{path}: {error}") from None
+    for doubt in doubts(camera):
+        warnings.warn(f"{path}: {doubt}", CameraWarning, stacklevel=2)
+    return camera
 
 
 def write_camera(path: Path, camera: CameraModel, *, notes: Mapping[str, Any] | None = None) -> None:
@@ -291,16 +304,28 @@ def _camera_of(content: Any) -> CameraModel:
             near = difflib.get_close_matches(str(name), _ACCEPTED, n=1)
             hint = f"did you mean {near[0]!r}? " if near else ""
             raise CameraError(f"unknown field {name!r}: {hint}known: {', '.join(_ACCEPTED)}")
+    content = {name: value if name in _NO_NUMBERS else _numbers(value) for name, value in content.items()}
     for name, accepted in _ACCEPTED.items():
         if name not in content and name not in _OPTIONAL:
             raise CameraError(f"field {name} is missing: it must be {accepted}")
         if name in content and not _accepts(name, content[name]):
-            raise CameraError(f"field {name} is {content[name]!r}: it must be {accepted}")
+            written = point_for_comma(content[name])
+            hint = "" if written is None or name in _NO_NUMBERS else f"; write {written}, with a point"
+            raise CameraError(f"field {name} is {content[name]!r}: it must be {accepted}{hint}")
     values: dict[str, Any] = {field.name: content[field.name] for field in fields(CameraModel) if field.name in content}
     values["crop"] = Crop(**content["crop"])
     values["T_base_camera"] = tuple(tuple(float(x) for x in row) for row in content["T_base_camera"])
     values |= {name: float(value) for name, value in values.items() if _ACCEPTED[name].startswith(_NUMBER)}
     return CameraModel(**values)
+
+
+def _numbers(value: Any) -> Any:
+    """Return a value of the file with the texts in it that spell numbers read as such."""
+    if isinstance(value, list):
+        return [_numbers(item) for item in value]
+    if isinstance(value, dict):
+        return {key: _numbers(item) for key, item in value.items()}
+    return as_number(value)
 
 
 def _accepts(name: str, value: Any) -> bool:

@@ -90,6 +90,14 @@ class CameraError(ManicmError):
     """A camera's description or a depth image that cannot be used."""
 
 
+class ManicmWarning(UserWarning):
+    """Base of all warnings: something is allowed and yet probably not what was meant; one line with its cause."""
+
+
+class CameraWarning(ManicmWarning):
+    """A camera whose numbers can hardly be those of one camera and one resolution."""
+
+
 class TrainingDivergedError(ManicmError):
     """A training whose loss became NaN or infinite."""
 

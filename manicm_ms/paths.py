@@ -16,10 +16,11 @@ from importlib import resources
 from pathlib import Path
 from typing import Any
 
-from manicm_ms.errors import ManicmError, NoSpaceError
+from manicm_ms.errors import ManicmError, NoSpaceError, OutputExistsError
 
 _CHUNK_BYTES = 1 << 20
 _TEMPORARY = ".tmp"  # last part of the names of temporaries
+_RANDOM = "[a-z0-9_]{8}"  # the part before it
 _FULL_DISK = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
 
 
@@ -54,6 +55,22 @@ def sha256(path: Path) -> str:
         while block := f.read(_CHUNK_BYTES):
             digest.update(block)
     return digest.hexdigest()
+
+
+def require_free(out: Path, overwrite: bool) -> None:
+    """Raise OutputExistsError unless the file `out` can be written: nothing stands there, or a file to be replaced."""
+    if out.is_dir():
+        raise OutputExistsError(f"{out} is a folder: name a file for --out, as in {out / f'NAME{out.suffix}'}")
+    if out.exists() and not overwrite:
+        raise OutputExistsError(f"{out} exists: choose another --out or add --overwrite")
+    for parent in out.parents:
+        if parent.exists() and not parent.is_dir():
+            raise OutputExistsError(f"{parent} is a file, so that {out} cannot lie in it: choose another --out")
+
+
+def without_temporaries(text: str) -> str:
+    """Return `text` with each name of a temporary replaced by that of the file or folder which it was to become."""
+    return re.sub(rf"(^|[/\s'\"])\.([^/]+?)\.{_RANDOM}{re.escape(_TEMPORARY)}", r"\1\2", text)
 
 
 def write_bytes(path: Path, content: bytes) -> None:
@@ -209,7 +226,7 @@ def _temporary(path: Path, make: Callable[..., tuple[int, str]]) -> tuple[int, P
 
 def _sweep(path: Path) -> None:
     """Remove the temporaries of `path` that no process holds."""
-    ours = re.compile(re.escape(f".{path.name}.") + "[a-z0-9_]{8}" + re.escape(_TEMPORARY))
+    ours = re.compile(re.escape(f".{path.name}.") + _RANDOM + re.escape(_TEMPORARY))
     for stray in [p for p in path.parent.iterdir() if ours.fullmatch(p.name)]:
         try:
             handle = os.open(stray, os.O_RDONLY | os.O_NOFOLLOW)

@@ -82,13 +82,13 @@ class LineProgress(Progress):
         self._watch.start()
 
     def stop(self) -> None:
-        """Write the last state of every task that has not been told to be finished."""
+        """Write the last state of every task that got somewhere, unless it has been told to be finished."""
         if self._watch is None:
             return
         self._ended.set()
         self._watch.join()
         self._watch = None
-        self._write()
+        self._write(least=1)
 
     def tick(self) -> None:
         """Write the lines if it is time to."""
@@ -103,9 +103,9 @@ class LineProgress(Progress):
         while not self._ended.wait(_LOOK_S):
             self.tick()
 
-    def _write(self) -> None:
+    def _write(self, least: int = 0) -> None:
         for task in self.tasks:
-            if task.visible and task.started and task.id not in self._finished:
+            if task.visible and task.completed >= least and task.id not in self._finished:
                 self.console.print(self._line(task), markup=False, highlight=False, soft_wrap=True)
                 if task.finished:
                     self._finished.add(task.id)

@@ -12,8 +12,10 @@ from manicm_ms.paths import (
     exclusive_lock,
     is_disk_full,
     replaced_folder,
+    require_free,
     set_aside,
     temporary_folder,
+    without_temporaries,
     write_text,
 )
 
@@ -162,3 +164,33 @@ def test_a_full_disk_is_recognised():
     assert is_disk_full(caught.value)
     assert is_disk_full(ValueError("I/O error: No space left on device (os error 28)"))
     assert not is_disk_full(FileNotFoundError(2, "No such file"))
+
+
+# ---- what a user is told
+
+
+def test_messages_name_what_a_temporary_was_to_become(tmp_path):
+    out = tmp_path / "my page.html"
+    out.mkdir()
+    with pytest.raises(IsADirectoryError) as caught:
+        write_text(out, "x")
+    assert without_temporaries(f"{caught.value.filename}: no") == f"{out}: no"
+    with temporary_folder(tmp_path / "data.zarr") as fresh:
+        inner = f"cannot write '{fresh / 'data' / '.zarray'}'"
+    assert without_temporaries(inner) == f"cannot write '{tmp_path}/data.zarr/data/.zarray'"
+    assert without_temporaries("/tmp/.x.tmp and notes.tmp") == "/tmp/.x.tmp and notes.tmp"
+
+
+def test_a_file_that_cannot_be_written_is_refused_beforehand(tmp_path):
+    (tmp_path / "file.ply").touch()
+    (tmp_path / "folder.ply").mkdir()
+    require_free(tmp_path / "new" / "cloud.ply", overwrite=False)
+    require_free(tmp_path / "file.ply", overwrite=True)
+    for out, overwrite, words in (
+        ("file.ply", False, "file.ply exists: choose another --out or add --overwrite"),
+        ("folder.ply", False, r"folder.ply is a folder: name a file for --out, as in .*folder.ply/NAME\.ply"),
+        ("folder.ply", True, "is a folder"),
+        ("file.ply/cloud.ply", True, "file.ply is a file, so that .*cloud.ply cannot lie in it"),
+    ):
+        with pytest.raises(OutputExistsError, match=words):
+            require_free(tmp_path / out, overwrite)

@@ -9,8 +9,8 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from manicm_ms.errors import CalibrationError, ConfigError, OutputExistsError, UnknownNameError
-from manicm_ms.paths import write_bytes
+from manicm_ms.errors import CalibrationError, ConfigError, UnknownNameError
+from manicm_ms.paths import require_free, write_bytes
 
 DICTIONARIES = tuple(
     sorted(name.removeprefix("DICT_") for name in dir(cv2.aruco) if name.startswith("DICT_") and "h" not in name)
@@ -151,8 +151,7 @@ def print_board(spec: CharucoSpec, out: Path, *, overwrite: bool = False) -> str
 
     if out.suffix not in (".pdf", ".svg", ".png"):
         raise ConfigError(f"{out}: a board is written as .pdf, .svg or .png")
-    if out.exists() and not overwrite:
-        raise OutputExistsError(f"{out} exists: choose another --out or add --overwrite")
+    require_free(out, overwrite)
     paper, sheet = _sheet(spec)
     figure = Figure(figsize=(sheet[0] / _INCH_M, sheet[1] / _INCH_M))
     width, height = (side / whole for side, whole in zip(spec.size, sheet, strict=True))

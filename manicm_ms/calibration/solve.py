@@ -31,7 +31,8 @@ from manicm_ms.calibration.hand_eye import (
 from manicm_ms.calibration.intrinsics import solve_intrinsics
 from manicm_ms.calibration.robot_poses import read_poses
 from manicm_ms.camera_model import CameraModel, Crop, default_camera, read_camera, write_camera
-from manicm_ms.errors import CalibrationError, OutputExistsError
+from manicm_ms.errors import CalibrationError
+from manicm_ms.paths import require_free
 
 MIN_VIEWS = 6
 """Views that are needed: three determine both poses, the others show whether one of them is wrong."""
@@ -146,8 +147,7 @@ def calibrate(
     Raises:
         CalibrationError, CameraError, OutputExistsError: see the message; nothing was written.
     """
-    if out.exists() and not overwrite:
-        raise OutputExistsError(f"{out} exists: choose another --out or add --overwrite")
+    require_free(out, overwrite)
     template = None if intrinsics is None else read_camera(intrinsics)
     tools = read_poses(poses or _poses_beside(images))
     pictures = _read_images(images, tools, template)
@@ -208,6 +208,7 @@ def solve_views(
 
 
 def _poses_beside(images: Path) -> Path:
+    _require_folder(images)
     found = [path for path in (images / "poses.json", images / "poses.csv") if path.is_file()]
     if len(found) != 1:
         has = "both poses.json and poses.csv" if found else "neither poses.json nor poses.csv"
@@ -215,9 +216,16 @@ def _poses_beside(images: Path) -> Path:
     return found[0]
 
 
+def _require_folder(images: Path) -> None:
+    if not images.is_dir():
+        what = "is a file" if images.exists() else "does not exist"
+        raise CalibrationError(f"{images} {what}: name the folder of the recorded views")
+
+
 def _read_images(folder: Path, tools: dict[str, RigidTransform], template: CameraModel | None) -> dict[str, np.ndarray]:
     """Return name -> (H, W) uint8 of all images, which have a pose each and one size, that of the intrinsics."""
-    names = sorted(path.name for path in folder.iterdir() if path.suffix.lower() in _IMAGES) if folder.is_dir() else []
+    _require_folder(folder)
+    names = sorted(path.name for path in folder.iterdir() if path.suffix.lower() in _IMAGES)
     if not names:
         raise CalibrationError(f"{folder} holds no image ({', '.join(_IMAGES)}): name the folder of the recorded views")
     if without := [name for name in names if name not in tools]:

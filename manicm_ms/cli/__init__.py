@@ -16,12 +16,12 @@ from typing import Annotated, Any, Literal
 import tyro
 
 from manicm_ms.cli.counts import AtLeast, Count, CountOrNone, OptionalCount, Seed, checked
+from manicm_ms.cli.messages import PROGRAM, warnings_in_one_line
 from manicm_ms.errors import ConfigError, ManicmError, UnknownNameError
-from manicm_ms.paths import is_disk_full
+from manicm_ms.paths import is_disk_full, without_temporaries
 
 Backend = Literal["auto", "cpu", "gpu"]
 Command = Callable[..., int | None]
-PROGRAM = "manicm-ms"
 USER_ERROR, INTERRUPTED = 2, 130
 _CHECK_THE_PATH = "check the paths on the command line"
 _REMEDIES = {
@@ -436,9 +436,10 @@ def _run(arguments: list[str]) -> int | None:
     name, rest = arguments[0], arguments[1:]
     if name not in (*_PLAIN, *_WITH_PRESET):
         raise UnknownNameError("command", name, (*_PLAIN, *_WITH_PRESET))
-    return tyro.cli(
-        checked(_command(name, rest)), prog=f"{PROGRAM} {name}", args=rest, config=(tyro.conf.OmitArgPrefixes,)
-    )
+    with warnings_in_one_line():
+        return tyro.cli(
+            checked(_command(name, rest)), prog=f"{PROGRAM} {name}", args=rest, config=(tyro.conf.OmitArgPrefixes,)
+        )
 
 
 def _command(name: str, arguments: list[str]) -> Command:
@@ -466,7 +467,7 @@ def _explain(error: OSError) -> str:
 
 
 def _complain(message: str) -> int:
-    print(f"{PROGRAM}: {' '.join(message.split())}", file=sys.stderr)
+    print(f"{PROGRAM}: {without_temporaries(' '.join(message.split()))}", file=sys.stderr)
     return USER_ERROR
 
 

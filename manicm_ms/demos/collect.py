@@ -25,7 +25,7 @@ from manicm_ms.demos.experts import EXPERTS, Expert
 from manicm_ms.demos.store import OPTIONAL_FIELDS, DemoStore, Episode, frame_shapes
 from manicm_ms.envs.simulator import ENVS, DemoRule
 from manicm_ms.envs.vec_env import VecEnv, make_vec
-from manicm_ms.errors import ConfigError, ManicmError, StoreError
+from manicm_ms.errors import ConfigError, ManicmError, OutputExistsError, StoreError
 from manicm_ms.paths import require_free_space
 from manicm_ms.progress import progress_bars
 from manicm_ms.provenance import package_versions
@@ -341,6 +341,8 @@ def collect(
     )  # fmt: skip
     _require_some(episodes)
     out = Path(out)
+    if out.is_file():
+        raise OutputExistsError(f"{out} is a file: choose a folder for --out")
     exists = out.exists() and not (out.is_dir() and not any(out.iterdir()))
     if exists and (finished := _finished(out, episodes, plan)):
         return finished

@@ -208,6 +208,34 @@ def test_an_error_about_no_file_is_not_hidden():
         _explain(ConnectionError("a defect"))
 
 
+@pytest.mark.parametrize(
+    ("line", "hint"),
+    [
+        ("collect ur3e/slide-block --out FILE", "FILE is a file: choose a folder for --out"),
+        ("train simple_dp3 --data DATA --out FILE", "FILE already holds something else: choose another --out"),
+        ("board --out FILE.pdf", "FILE.pdf exists: choose another --out or add --overwrite"),
+        ("board --out FOLDER.pdf --overwrite", "FOLDER.pdf is a folder: name a file for --out"),
+        ("board --out FILE.pdf/board.pdf", "FILE.pdf is a file, so that FILE.pdf/board.pdf cannot lie in it"),
+        ("inspect DATA --html FOLDER", "FOLDER: Is a directory: this is a folder where a file is wanted"),
+        ("calibrate NOWHERE --out camera.yaml", "NOWHERE does not exist: name the folder of the recorded views"),
+        ("calibrate FILE --out camera.yaml", "FILE is a file: name the folder of the recorded views"),
+        ("calibrate FOLDER --out camera.yaml", "FOLDER holds neither poses.json nor poses.csv"),
+        ("train simple_dp3 --data NOWHERE --out out", "no store at NOWHERE"),
+        ("inspect NOWHERE", "no store at NOWHERE"),
+    ],
+)
+def test_places_that_do_not_fit_are_refused_with_advice_that_helps(told, demos, tmp_path, monkeypatch, line, hint):
+    monkeypatch.chdir(tmp_path)
+    for name in ("FILE", "FILE.pdf"):
+        (tmp_path / name).touch()
+    for name in ("FOLDER", "FOLDER.pdf"):
+        (tmp_path / name).mkdir()
+    result = told(*(str(demos) if word == "DATA" else word for word in line.split()))
+    assert_one_line((result[0], "", result[2].splitlines(keepends=True)[-1]), hint)
+    assert ".tmp" not in result[2]
+    assert f"manicm-ms {line}" not in result[2], "the refused command is no advice"
+
+
 # ---- work
 
 

@@ -39,6 +39,20 @@ def recording(tmp_path):
 
 
 @pytest.fixture
+def objects(recording):
+    """The same recording with readings of the workspace alone."""
+    camera = default_camera()
+    raw = cv2.imread(str(recording / "depth.png"), cv2.IMREAD_UNCHANGED)
+    v, u = np.indices(raw.shape)
+    z = raw * 0.001
+    points = np.stack([(u - camera.cx) / camera.fx * z, (v - camera.cy) / camera.fy * z, z], axis=-1)
+    points = points @ camera.pose[:3, :3].T + camera.pose[:3, 3]
+    seen = ((points > WORKSPACE.low) & (points < WORKSPACE.high)).all(axis=-1)
+    assert cv2.imwrite(str(recording / "depth.png"), np.where(seen, raw, 0).astype(np.uint16))
+    return recording
+
+
+@pytest.fixture
 def told(capsys):
     def run(*arguments):
         with pytest.raises(SystemExit) as end:
@@ -81,16 +95,77 @@ def test_ply_holds_the_same_points(recording, told):
     np.testing.assert_array_equal(points, expected(recording, 100))
 
 
-def test_a_camera_that_looks_elsewhere_is_pointed_out(recording, told):
-    content = yaml.safe_load(asset("cameras", "d435i.yaml").read_text())
-    content["T_base_camera"][0][3] += 3.0
-    (recording / "camera.yaml").write_text(yaml.safe_dump(content))
-    options = ("--camera", recording / "camera.yaml", "--out", recording / "cloud.npy")
-    status, said, _ = told(recording / "depth.png", *options)
+def refused(folder, told, changed=None, *options, **fields):
+    """The camera file with another pose or other fields gives no cloud; return the one line that says why."""
+    content = yaml.safe_load(asset("cameras", "d435i.yaml").read_text()) | fields
+    if changed is not None:
+        content["T_base_camera"] = changed.tolist()
+    (folder / "camera.yaml").write_text(yaml.safe_dump(content))
+    out = folder / "cloud.npy"
+    status, _, said = told(folder / "depth.png", "--camera", folder / "camera.yaml", "--out", out, *options)
+    assert status == USER_ERROR
+    assert not out.exists()
+    line = said.splitlines()[-1]  # behind the camera file's own warnings
+    assert "shows nothing of the workspace of ur3e/slide-block" in line
+    return line
+
+
+def test_a_camera_that_looks_elsewhere_gives_no_cloud(recording, told):
+    pose = default_camera().pose
+    pose[0, 3] += 3.0
+    line = refused(recording, told, pose)
+    assert "the workspace is x 0.15 to 0.50, y -0.25 to 0.25, z 0.01 to 0.15 m" in line
+    assert re.search(r"it reads x 2\.\d\d to 3\.\d\d, y ", line)
+    assert "is T_base_camera that of this cell" in line
+
+
+BODY = np.array([[0, 0, 1], [-1, 0, 0], [0, -1, 0]], float).T  # OpenCV's axes -> x forward, y left, z up
+
+
+@pytest.mark.parametrize(
+    ("wrong", "cause"),
+    [
+        (np.linalg.inv, "its inverse"),
+        (lambda T: np.diag([-1.0, -1, 1, 1]) @ T, "UR's own base frame"),
+        (lambda T: np.block([[T[:3, :3] @ BODY, T[:3, 3:]], [T[3:]]]), "x forward"),
+        (lambda T: T @ np.diag([1.0, -1, -1, 1]), "y up"),
+        (lambda T: np.block([[T[:3, :3], 1000 * T[:3, 3:]], [T[3:]]]), "millimetres"),
+        (lambda T: np.block([[T[:3, :3], 100 * T[:3, 3:]], [T[3:]]]), "centimetres"),
+    ],
+)
+def test_the_usual_mistakes_in_a_pose_are_named(objects, told, wrong, cause):
+    pose = wrong(default_camera().pose)
+    pose[3] = (0, 0, 0, 1)
+    assert cause in refused(objects, told, pose)
+
+
+def test_another_depth_unit_is_named(objects, told):
+    assert "depth_unit looks like 0.001 m, not 0.0005" in refused(objects, told, depth_unit=0.0005)
+
+
+def test_a_glimpse_of_the_workspace_is_written_and_explained(objects, told):
+    pose = default_camera().pose
+    pose[0, 3] += 0.345
+    camera = replace(default_camera(), T_base_camera=tuple(map(tuple, pose.tolist())))
+    write_camera(objects / "camera.yaml", camera)
+    out = objects / "cloud.npy"
+    status, said, _ = told(objects / "depth.png", "--camera", objects / "camera.yaml", "--out", out)
     assert status == 0
-    assert "0 of them distinct" in said
-    assert "T_base_camera" in said
-    assert not np.load(recording / "cloud.npy").any()
+    distinct = len(np.unique(np.load(out), axis=0))
+    assert 0 < distinct < 64
+    assert f"only {distinct} points are seen: it reads x" in said
+
+
+def test_intrinsics_of_another_resolution_are_doubted_in_one_line(objects, told):
+    camera = replace(default_camera(), fx=424.0, fy=424.0, cx=423.5)
+    write_camera(objects / "camera.yaml", camera)
+    out = objects / "cloud.npy"
+    status, _, said = told(objects / "depth.png", "--camera", objects / "camera.yaml", "--out", out)
+    assert status == 0
+    assert said.startswith("manicm-ms: warning: ")
+    assert said.count("\n") == 1
+    assert "cx 423.5 lies far from 319.5, the middle of the 640x480 picture" in said
+    assert "those of the 848x480 stream?" in said
 
 
 @pytest.mark.parametrize(
@@ -102,6 +177,9 @@ def test_a_camera_that_looks_elsewhere_is_pointed_out(recording, told):
         ({"--realism": "d435"}, "did you mean 'd435i'"),
         ({"--out": "cloud.xyz"}, "ends in .ply or .npy"),
         ({"--num-points": "0"}, "at least 1"),
+        ({"--num-points": "99999999"}, "1 to 7056, the pixels of the 84x84 picture"),
+        ({"--out": "folder.ply"}, "folder.ply is a folder: name a file"),
+        ({"--out": "depth.png/cloud.ply"}, "depth.png is a file, so that depth.png/cloud.ply cannot lie in it"),
         ({"depth": "small.png"}, "small.png is 320x240 pixels"),
         ({"depth": "colour.png"}, "3 channel(s) of uint8"),
         ({"--camera": "other.yaml"}, "field model is 'brown_conrady'"),
@@ -109,6 +187,7 @@ def test_a_camera_that_looks_elsewhere_is_pointed_out(recording, told):
 )
 def test_errors_are_one_line_and_nothing_is_written(recording, told, monkeypatch, changes, words):
     monkeypatch.chdir(recording)
+    Path("folder.ply").mkdir()
     cv2.imwrite("small.png", np.full((240, 320), 600, np.uint16))
     cv2.imwrite("colour.png", np.full((480, 640, 3), 60, np.uint8))
     content = yaml.safe_load(asset("cameras", "d435i.yaml").read_text())
