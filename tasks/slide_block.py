@@ -59,6 +59,7 @@ class SlideBlockEnv(UR3eTabletopEnv):
     start_qpos: ClassVar[tuple[float, ...]] = FINGERS_ALONG_X  # their flat sides face +y and -y
     start_opening: ClassVar[float] = 0.0
     table_friction: ClassVar[float] = TABLE_FRICTION
+    remembered: ClassVar[tuple[str, ...]] = ("cube_start",)
     reward_weights: ClassVar[dict[str, float]] = {"reach": 2.0, "push": 2.0, "fall": 1.0, "cube_in_place": 1.0}
 
     def _load_objects(self) -> dict[str, Actor]:

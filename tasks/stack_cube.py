@@ -61,6 +61,7 @@ class StackCubeEnv(UR3eTabletopEnv):
     start_qpos: ClassVar[tuple[float, ...]] = FINGERS_ALONG_Y
     start_opening: ClassVar[float] = OPENING_MAX
     table_friction: ClassVar[float] = FRICTION
+    remembered: ClassVar[tuple[str, ...]] = ("white_start",)
     reward_weights: ClassVar[dict[str, float]] = {
         "reach": 1.0, "grasp": 1.0, "carry": 2.0, "stack": 1.0, "release": 1.0, "white_in_place": 1.0
     }  # fmt: skip

@@ -9,7 +9,6 @@ from typing import Any, ClassVar
 import numpy as np
 import sapien
 import torch
-from mani_skill.envs.sapien_env import BaseEnv
 from mani_skill.sensors.camera import CameraConfig
 from mani_skill.utils.building.actor_builder import ActorBuilder
 from mani_skill.utils.geometry.rotation_conversions import quaternion_to_matrix
@@ -20,6 +19,7 @@ from torch import Tensor
 from manicm_ms.camera_model import CameraModel
 from manicm_ms.envs.cameras import D435I, WIDE, FixedCamera
 from manicm_ms.envs.depth_clouds import sapien_pose
+from manicm_ms.envs.maniskill_state import RestorableEnv
 from manicm_ms.envs.row_builders import RowBuilders
 from manicm_ms.errors import ConfigError
 from manicm_ms.point_cloud import Box
@@ -80,7 +80,7 @@ def ur3e_spec(env_id: str, max_episode_steps: int, objects: tuple[str, ...]) -> 
 Vector = tuple[float, float, float]
 
 
-class UR3eTabletopEnv(BaseEnv):
+class UR3eTabletopEnv(RestorableEnv):
     """A UR3e with an AG-95 on a table, whose top is z = 0 in each row's world.
 
     The base stands at the origin, world frame = base frame, unless `reset(options={"reconfigure": True, "realism":

@@ -130,6 +130,10 @@ class LimitedPoseController(_RowwiseReset, PDEEPoseController):
         self._target_qpos = limit_joint_step(wanted, previous_qpos, self._max_joint_step)
         self.set_drive_targets(self._target_qpos)
 
+    def get_state(self) -> dict[str, Tensor]:
+        """Return what observations tell of the controller: a copy of its target pose (N, 7) where it keeps one."""
+        return {name: value.clone() for name, value in super().get_state().items()}
+
     def _solve(self, target_pose: Pose, start_qpos: Tensor) -> Tensor | None:
         """Return joint positions (N, J) near `start_qpos` that reach the target, or None where there are none (CPU)."""
         full_qpos = self.articulation.get_qpos().clone()

@@ -19,6 +19,7 @@ from mani_skill.utils.structs import Actor, Link, Pose
 from torch import Tensor
 
 from manicm_ms.paths import asset
+from manicm_ms.robots import memory
 from manicm_ms.robots.controllers import LimitedPoseControllerConfig, OpeningControllerConfig
 from manicm_ms.robots.limits import pose_in_frame
 
@@ -128,6 +129,18 @@ class UR3eAG95(BaseAgent):
         super().reset(init_qpos)
         for controller in self.controller.controllers.values():
             controller.beginning = self.scene._reset_mask
+
+    def get_controller_state(self) -> dict[str, dict[str, Tensor]]:
+        """Return copies of what the active controllers remember from step to step, by controller: see `memory`."""
+        return {uid: memory.of(controller) for uid, controller in self.controller.controllers.items()}
+
+    def set_controller_state(self, state: dict[str, Any]) -> None:
+        """Take back what `get_controller_state` returned, in the rows of `scene._reset_mask`.
+
+        What the state lacks, as those of earlier versions do, stays as it is.
+        """
+        for uid, controller in self.controller.controllers.items():
+            memory.restore(controller, state.get(uid, {}))
 
     @property
     def _controller_configs(self) -> dict[str, DictControllerConfig]:
