@@ -11,6 +11,7 @@ import cv2
 import numpy as np
 from scipy.spatial.transform import RigidTransform
 
+from manicm_ms.calibration import other_boards
 from manicm_ms.calibration.board import CharucoSpec, detect
 from manicm_ms.calibration.hand_eye import (
     HandEye,
@@ -152,6 +153,8 @@ def calibrate(
     tools = read_poses(poses or _poses_beside(images))
     pictures = _read_images(images, tools, template)
     seen, rejected = _detect(pictures, tools, board, on_image or (lambda name: None))
+    if len(seen) < MIN_VIEWS and (fits := other_boards.advice(board, list(pictures.values()))):
+        raise CalibrationError(f"{len(seen)} of {len(pictures)} images show a {board}: {fits}")
     size = next(iter(pictures.values())).shape[::-1]
     solved = solve_views(seen, rejected, board, (size[0], size[1]), template)
     write_camera(out, solved.camera, notes=solved.notes())

@@ -13,6 +13,7 @@ from synthetic_views import BOARD, INFRARED, SIZE, TRUTH, error, nudge, views
 
 from manicm_ms.calibration import CharucoSpec, calibrate, print_board, solve_views
 from manicm_ms.calibration.board import detect
+from manicm_ms.calibration.other_boards import advice
 from manicm_ms.camera_model import Crop, default_camera, read_camera, write_camera
 from manicm_ms.cli import USER_ERROR, main
 from manicm_ms.errors import CalibrationError, CameraError, ConfigError, OutputExistsError, UnknownNameError
@@ -195,11 +196,40 @@ def test_other_boards_are_refused(session, copied, tmp_path):
     rewritten(copied, tools)
     for file in set(copied.glob("*.png")) - {copied / name for name in tools}:
         file.unlink()
-    assert_refused(CalibrationError, "0 of 6 views are usable, at least 6 .*no marker of 6X6_50 found",
+    assert_refused(CalibrationError, r"0 of 6 images show .* 6X6_50 .*: --dictionary 4X4_50 fits, in 3 of 3 images",
                    copied, out, replace(BOARD, dictionary="6X6_50"))  # fmt: skip
+    assert_refused(CalibrationError, r"a board of 7 x 5 squares .*: --squares 5 7 fits, in 3 of 3 images",
+                   copied, out, replace(BOARD, squares_x=7, squares_y=5))  # fmt: skip
     assert_refused(CalibrationError, "not of this board", copied, out, replace(BOARD, squares_x=4, squares_y=4))
     assert_refused(CalibrationError, r"squares are (29|30)\.\d mm, not 28 mm", copied, out,
                    replace(BOARD, square_length=0.028), intrinsics=camera_file(tmp_path / "given.yaml"))  # fmt: skip
+
+
+def even_board(legacy):
+    """With an even number of squares in a column the two patterns differ."""
+    return CharucoSpec(6, 8, 0.03, 0.022, "4X4_50", legacy)
+
+
+@pytest.mark.parametrize(
+    ("asked", "shown", "options"),
+    [
+        (even_board(False), even_board(True), "--legacy"),
+        (even_board(True), even_board(False), "--no-legacy"),
+        (replace(even_board(False), squares_x=8, squares_y=6), even_board(True), "--squares 6 8 --legacy"),
+        (replace(even_board(True), dictionary="5X5_50"), even_board(False), "--dictionary 4X4_50 --no-legacy"),
+    ],
+)
+def test_the_board_that_is_shown_is_found_out(asked, shown, options):
+    picture = cv2.copyMakeBorder(shown.picture(3000), 60, 60, 60, 60, cv2.BORDER_CONSTANT, value=255)
+    with pytest.raises(CalibrationError):
+        detect(asked, picture)
+    assert advice(asked, [picture]) == f"{options} fits, in 1 of 1 images tried"
+
+
+def test_no_board_is_advised_where_none_is_shown():
+    blank = np.full((480, 640), 128, np.uint8)
+    assert advice(BOARD, [blank] * 12) is None
+    assert advice(even_board(False), [CharucoSpec(4, 4).picture(3000)]) is None
 
 
 def test_poses_that_are_missing_are_refused(session, copied, tmp_path):
@@ -223,7 +253,9 @@ def test_poses_in_another_order_or_inverted_are_refused(tmp_path):
 
 def test_images_that_are_missing_broken_or_of_another_size_are_refused(session, copied, tmp_path):
     out = tmp_path / "camera.yaml"
-    assert_refused(CalibrationError, "holds no image", tmp_path / "nowhere", out, poses=session[0] / "poses.json")
+    assert_refused(
+        CalibrationError, "nowhere does not exist", tmp_path / "nowhere", out, poses=session[0] / "poses.json"
+    )
     (copied / "04.png").unlink()
     (copied / "04.png").write_bytes(b"")
     assert_refused(CalibrationError, "04.png is no image", copied, out)
