@@ -165,6 +165,9 @@ def convert_command(
     colors: bool = False,
     frame: str | None = None,
     control_hz: float | None = None,
+    cloud_scale: float | None = None,
+    depth_scale: float | None = None,
+    action_scale: tuple[float, ...] = (),
 ) -> None:
     """Convert a store for other tools (--to maniskill, lerobot, minari), or theirs into one (--from dp3).
 
@@ -179,10 +182,16 @@ def convert_command(
         colors: with --from, keep rgb beside xyz.
         frame: with --from and no --env, frame of the clouds: world (if not given) or robot_base.
         control_hz: with --from and no --env, actions per second; 10 if not given.
+        cloud_scale: with --from, metres of a unit of the clouds: 0.001 for millimetres.
+        depth_scale: with --from, metres of a unit of the depth images.
+        action_scale: with --from, what actions are divided by to lie in [-1, 1]: one number, or one an entry.
     """
     from manicm_ms.cli.converting import convert_or_import
 
-    reading = {"env": env, "num_points": num_points, "colors": colors or None, "frame": frame, "control_hz": control_hz}
+    reading = {
+        "env": env, "num_points": num_points, "colors": colors or None, "frame": frame, "control_hz": control_hz,
+        "cloud_scale": cloud_scale, "depth_scale": depth_scale, "action_scale": action_scale or None,
+    }  # fmt: skip
     convert_or_import(store, out, to, from_, {"task": task}, reading)
 
 

@@ -39,6 +39,10 @@ def convert_or_import(
 
         options = {name: value for name, value in reading.items() if value is not None}
         done = import_store(store, str(source), out, command=this_command(), **options)
-    print(f"{done.path}: {done.episodes} episodes, {done.frames} frames")
+    print(f"{done.path}: {_count(done.episodes, 'episode')}, {_count(done.frames, 'frame')}")
     for note in done.notes:
         print(f"  {note}")
+
+
+def _count(number: int, what: str) -> str:
+    return f"{number} {what}{'' if number == 1 else 's'}"

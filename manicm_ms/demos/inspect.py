@@ -122,8 +122,11 @@ def _cloud_strip(clouds: np.ndarray, steps: np.ndarray) -> str:
     low, high = clouds[..., :3].min(axis=(0, 1)), clouds[..., :3].max(axis=(0, 1))
     for place, k in enumerate(shown):
         axes = figure.add_subplot(1, len(shown), place + 1, projection="3d")
-        colors = clouds[k, :, 3:].clip(0, 1) if clouds.shape[-1] == 6 else clouds[k, :, 2]
-        axes.scatter(*clouds[k, :, :3].T, c=colors, s=2, cmap="viridis", vmin=low[2], vmax=high[2])
+        if clouds.shape[-1] == 6:
+            coloring: dict[str, Any] = {"c": clouds[k, :, 3:].clip(0, 1)}
+        else:
+            coloring = {"c": clouds[k, :, 2], "cmap": "viridis", "vmin": low[2], "vmax": high[2]}
+        axes.scatter(*clouds[k, :, :3].T, s=2, **coloring)
         axes.set(xlim=(low[0], high[0]), ylim=(low[1], high[1]), zlim=(low[2], high[2]))
         axes.set_box_aspect(np.maximum(high - low, 1e-3), zoom=1.5)
         axes.view_init(elev=25, azim=-60)
@@ -188,5 +191,8 @@ def _print_summary(console: Console, found: Survey) -> None:
     for problem in found.problems:
         console.print("[bold red]problem:[/] ", end="")
         console.print(problem, markup=False, soft_wrap=True)
+    for remark in found.remarks:
+        console.print("[bold yellow]remark:[/] ", end="")
+        console.print(remark, markup=False, soft_wrap=True)
     if not found.problems:
         console.print("no problem found")

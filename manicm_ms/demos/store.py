@@ -3,7 +3,7 @@
 ::
 
     store.zarr/                zarr format 2
-      .zattrs                  env_spec, provenance, attempts, format
+      .zattrs                  env_spec, provenance, attempts, format, chunks
       data/point_cloud         (F, P, C) float32, metres in `ObsSpec.frame`
       data/state               (F, D) float32, what the package calls agent_pos
       data/action              (F, Da) float32, normalised to [-1, 1]
@@ -21,6 +21,9 @@ arrays, then the new end into a chunk beyond the array's length, and last replac
 `meta/episode_ends/.zarray` by one that is one longer. That rename is the commit: a kill before it leaves
 the episodes committed before, a kill after it leaves one more. What lies past the last end is cut
 when the store is next opened for appending.
+
+Every chunk has a file, those of zeros too, and the attribute `chunks` says so: one that is missing was lost.
+Stores without that attribute were made before, when zarr left out the files of zeros.
 """
 
 from __future__ import annotations
@@ -40,6 +43,16 @@ import numcodecs
 import numpy as np
 import zarr
 
+from manicm_ms.demos.zarr_files import (
+    ALL_WRITTEN,
+    EPISODE_ENDS,
+    looks_like_dp3,
+    missing_chunks,
+    open_array,
+    refuse_pickles,
+    require_folder,
+    say_missing,
+)
 from manicm_ms.errors import ManicmError, NoSpaceError, OutputExistsError, StoreError
 from manicm_ms.paths import is_disk_full, require_free_space, sync, take_lock, temporary_folder, write_json
 from manicm_ms.types import EnvSpec
@@ -61,10 +74,17 @@ OPTIONAL_FIELDS = ("image", "depth", "privileged_state")
 EPISODE_ARRAYS = {"seed": np.dtype("<i8"), "success": np.dtype("bool"), "length": np.dtype("<i8")}
 """Arrays under `meta/` beside `episode_ends`, with their types."""
 
+STORE_ARRAYS = frozenset(
+    {*(f"data/{name}" for name in FRAME_ARRAYS.values()), *(f"meta/{n}" for n in EPISODE_ARRAYS), "meta/realism"}
+    | {EPISODE_ENDS}
+)
+"""Every array that a store may hold."""
+
 _CHUNK_FRAMES = 100  # about an episode; DP3's stores have the same
 _CHUNK_EPISODES = 1024
 _SPARE_BYTES = 32 << 20  # kept free beside what an append needs, so that the commit itself finds room
-_LOCK = ".lock"
+_LOCK = f"{EPISODE_ENDS}/.lock"  # within an array: zarr warns of strange files in groups
+_FORMER_LOCK = ".lock"
 
 
 @dataclass(frozen=True)
@@ -130,6 +150,7 @@ class DemoStore:
         self._fields = [f for f, name in FRAME_ARRAYS.items() if (path / "data" / name / ".zarray").is_file()]
         self.realism_names = self._read_realism_names()
         self._check_layout()
+        self.missing_files = self._missing_files()
         self._dirty = mode == "a"
         self._cut()
 
@@ -172,14 +193,17 @@ class DemoStore:
     def open(cls, path: Path | str, mode: Literal["r", "a"] = "r") -> DemoStore:
         """Open a store to read it ("r") or to append to it too ("a").
 
-        Raises StoreError where there is no store, it is damaged, or another process has it open for
+        Raises StoreError where there is no store, it is damaged or lacks files, or another process has it open for
         appending.
         """
         path = Path(path)
-        if not path.is_dir():
-            raise StoreError(f"no store at {path}: make one with 'manicm-ms collect ENV --out {path}'")
-        lock = _take_lock(path) if mode == "a" else None
+        require_folder(path, f"make one with 'manicm-ms collect ENV --out {path}'")
+        lock = None
         try:
+            if mode == "a":
+                _read_attrs(path)  # what is no store of ours stays untouched, by a lock too
+                _drop_former_lock(path)
+                lock = _take_lock(path)
             return cls(path, mode, lock)
         except ManicmError:
             _release(lock)
@@ -328,10 +352,15 @@ class DemoStore:
             raise StoreError(f"{self.path} is open for reading: open it with mode 'a' to append")
 
     def _frame_array(self, field: str) -> zarr.Array:
-        return self._group[f"data/{FRAME_ARRAYS[field]}"]  # type: ignore[return-value]
+        return self._array(f"data/{FRAME_ARRAYS[field]}")
 
     def _meta_array(self, name: str) -> zarr.Array:
-        return self._group[f"meta/{name}"]  # type: ignore[return-value]
+        return self._array(f"meta/{name}")
+
+    def _array(self, name: str) -> zarr.Array:
+        refuse_pickles(self.path, name)
+        array: zarr.Array = self._group[name]  # type: ignore[assignment]
+        return array.with_config({"write_empty_chunks": True})
 
     def _meta(self, name: str) -> np.ndarray:
         return np.asarray(self._meta_array(name)[: len(self)])
@@ -436,6 +465,17 @@ class DemoStore:
             if self._meta_array(name).shape[0] < len(ends):
                 raise StoreError(f"{self.path} is damaged: meta/{name} is shorter than meta/episode_ends")
 
+    def _missing_files(self) -> tuple[str, ...]:
+        """Return the chunk files that are not there; raise StoreError where that can only mean that they were lost."""
+        rows = {f"data/{FRAME_ARRAYS[f]}": self.num_frames for f in self._fields}
+        rows |= {f"meta/{name}": len(self) for name in (*self._meta_names(), "episode_ends")}
+        missing = [m for name, n in rows.items() for m in missing_chunks(self.path, name, self._array(name), n)]
+        if missing and ALL_WRITTEN.items() <= self._attrs.items():
+            raise StoreError(
+                f"{self.path} is damaged: {say_missing(missing)}; copy them from a backup, or collect again"
+            )
+        return tuple(missing)
+
 
 def _write_empty(
     path: Path, spec: EnvSpec, provenance: dict[str, Any], extras: tuple[str, ...], realism: tuple[str, ...]
@@ -465,16 +505,21 @@ def _write_empty(
     )
     write_json(
         path / ".zattrs",
-        {"format": FORMAT, "env_spec": spec.to_dict(), "provenance": provenance, "attempts": 0},
+        {"format": FORMAT, **ALL_WRITTEN, "env_spec": spec.to_dict(), "provenance": provenance, "attempts": 0},
     )
 
 
 def _read_attrs(path: Path) -> dict[str, Any]:
     """Return the store's attributes; raise StoreError where they are not those of a DemoStore."""
     file = path / ".zattrs"
+    attrs = json.loads(file.read_text(encoding="utf-8")) if file.is_file() else {}
+    if "format" not in attrs and looks_like_dp3(path):
+        raise StoreError(
+            f"{path} is a store of DP3's layout: 'manicm-ms convert {path} --from dp3 --out OURS.zarr' makes it one "
+            "of ours"
+        )
     if not (path / ".zgroup").is_file() or not file.is_file():
         raise StoreError(f"{path} is not a store of demonstrations (a zarr group of format 2 with attributes)")
-    attrs = json.loads(file.read_text(encoding="utf-8"))
     if attrs.get("format") != FORMAT:
         raise StoreError(
             f"{path} has the format {attrs.get('format')!r} where this version reads {FORMAT!r}: "
@@ -486,7 +531,7 @@ def _read_attrs(path: Path) -> dict[str, Any]:
 def _read_ends(path: Path) -> np.ndarray:
     """Return the committed episode ends, as they stand on the disk now."""
     # Opened anew each time: a reader sees what a writer in another process commits meanwhile.
-    return np.asarray(zarr.open_array(str(path / "meta" / "episode_ends"), mode="r", zarr_format=2)[:])
+    return np.asarray(open_array(path, EPISODE_ENDS)[:])
 
 
 def _extend(array: zarr.Array, start: int, rows: np.ndarray) -> None:
@@ -530,16 +575,23 @@ def _write_bytes(path: Path, content: bytes) -> None:
     os.replace(temporary, path)
 
 
-def _take_lock(path: Path) -> int:
+def _take_lock(path: Path, name: str = _LOCK) -> int:
     """Become the one writer of the store; raise StoreError naming the process that already is."""
 
     def refuse(holder: str) -> StoreError:
         return StoreError(f"{path} is being written by process {holder}: wait for it to end or stop it, then try again")
 
     try:
-        return take_lock(path / _LOCK, refuse)
+        return take_lock(path / name, refuse)
     except OSError as e:
         raise StoreError(f"cannot write to {path} ({e.strerror}): check its permissions") from e
+
+
+def _drop_former_lock(path: Path) -> None:
+    """Remove the lock file of earlier versions; raise StoreError where such a version is writing the store."""
+    if (path / _FORMER_LOCK).exists():
+        _release(_take_lock(path, _FORMER_LOCK))
+        (path / _FORMER_LOCK).unlink(missing_ok=True)
 
 
 def _release(lock: int | None) -> None:

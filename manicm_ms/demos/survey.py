@@ -12,9 +12,21 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import zarr
 
-from manicm_ms.demos.store import FORMAT, FRAME_ARRAYS, frame_shapes
+from manicm_ms.demos.remarks import field_remarks, length_remarks, unread_remarks
+from manicm_ms.demos.store import FORMAT, FRAME_ARRAYS, STORE_ARRAYS, frame_shapes
+from manicm_ms.demos.zarr_files import (
+    ALL_WRITTEN,
+    HEADERS,
+    array_names,
+    looks_like_dp3,
+    missing_chunks,
+    one_line,
+    open_array,
+    remark_missing,
+    require_folder,
+    say_missing,
+)
 from manicm_ms.errors import ConfigError, StoreError
 from manicm_ms.types import EnvSpec
 
@@ -43,6 +55,7 @@ class Survey:
         env_spec: what is fixed about the environment.
         bytes_on_disk: size of all files.
         problems: what is wrong, one sentence each; empty for a sound store.
+        remarks: what a user should know of a sound one, one sentence each: see `demos.remarks`.
     """
 
     path: str
@@ -60,6 +73,7 @@ class Survey:
     env_spec: dict[str, Any] = field(default_factory=dict)
     bytes_on_disk: int = 0
     problems: list[str] = field(default_factory=list)
+    remarks: list[str] = field(default_factory=list)
 
     def to_dict(self) -> dict[str, Any]:
         """Return plain JSON values."""
@@ -74,6 +88,8 @@ class _Surveyor:
         self.result = Survey(str(path))
         self.spec: EnvSpec | None = None
         self.ends = np.zeros(0, np.int64)
+        self.all_written = False
+        self.missing: list[str] = []
 
     def run(self) -> Survey:
         """Look at everything and return what was found."""
@@ -82,6 +98,7 @@ class _Surveyor:
         self._episodes()
         for name in FRAME_ARRAYS:
             self._frames(name)
+        self._files()
         return self.result
 
     def _problem(self, text: str) -> None:
@@ -91,17 +108,18 @@ class _Surveyor:
         try:
             attrs = json.loads((self.path / ".zattrs").read_text(encoding="utf-8"))
         except (OSError, ValueError) as e:
-            self._problem(f"the attributes (.zattrs) cannot be read: {_one_line(e)}")
+            self._problem(f"the attributes (.zattrs) cannot be read: {one_line(e)}")
             return
         if not isinstance(attrs, dict) or attrs.get("format") != FORMAT:
             self._problem(f"the attribute format is not {FORMAT!r}: the store was not written by 'manicm-ms collect'")
             return
+        self.all_written = ALL_WRITTEN.items() <= attrs.items()
         try:
             self.spec = EnvSpec.from_dict(attrs["env_spec"])
             provenance = dict(attrs["provenance"])
             self.result.attempts = int(attrs["attempts"])
         except (KeyError, TypeError, ValueError, AttributeError, ConfigError) as e:
-            self._problem(f"the attributes (.zattrs) are damaged: {_one_line(e)}")
+            self._problem(f"the attributes (.zattrs) are damaged: {one_line(e)}")
             return
         self.result.env_id, self.result.env_spec = self.spec.env_id, json.loads(json.dumps(self.spec.to_dict()))
         self.result.provenance = provenance
@@ -130,7 +148,7 @@ class _Surveyor:
             self._problem("meta/length differs from the lengths that meta/episode_ends gives")
 
     def _column(self, name: str) -> np.ndarray:
-        values = self._read(f"meta/{name}")
+        values = self._read(f"meta/{name}", len(self.ends))
         if values is None:
             return np.zeros(0)
         if len(values) != len(self.ends):
@@ -145,7 +163,7 @@ class _Surveyor:
         disk = f"data/{FRAME_ARRAYS[name]}"
         if name not in _REQUIRED and not (self.path / disk).exists():
             return
-        values = self._read(disk)
+        values = self._read(disk, self.result.frames)
         if values is None:
             return
         if self.spec is not None:
@@ -161,8 +179,10 @@ class _Surveyor:
         self._not_finite(disk, values)
         if name == "point_cloud" and values.ndim == 3:
             self._empty_clouds(values)
-        if name == "action" and np.nanmax(np.abs(values)) > 1:
-            self._problem(f"{disk} leaves [-1, 1]: it reaches {np.nanmax(np.abs(values)):.3g}")
+        if name == "action" and (reach := np.abs(values[np.isfinite(values)]).max(initial=0)) > 1:
+            self._problem(f"{disk} leaves [-1, 1]: it reaches {reach:.3g}")
+        if self.spec is not None and values.shape[1:] == frame_shapes(self.spec)[name][0]:
+            self.result.remarks += field_remarks(name, values, self.spec)
         if name in _RANGED:
             self.result.ranges[name] = self._ranges(name, values)
 
@@ -202,18 +222,31 @@ class _Surveyor:
             names = self.spec.action.names
         return list(names) if len(set(names)) == channels else [str(k) for k in range(channels)]
 
-    def _read(self, name: str) -> np.ndarray | None:
-        if not (self.path / name / ".zarray").is_file():
+    def _files(self) -> None:
+        """Name the chunk files that are missing and the arrays that nothing reads."""
+        if self.missing and self.all_written:
+            self._problem(f"{say_missing(self.missing)}: lost, as every chunk was written")
+        else:
+            self.result.remarks += remark_missing(self.missing)
+        self.result.remarks += unread_remarks(set(array_names(self.path)) - STORE_ARRAYS)
+        if self.spec is not None and self.result.lengths:
+            self.result.remarks += length_remarks(np.array(self.result.lengths), self.spec)
+
+    def _read(self, name: str, rows: int | None = None) -> np.ndarray | None:
+        """Return an array of which `rows` count, by default all, or None where it cannot be read."""
+        if not (self.path / name / HEADERS[2]).is_file():
             self._problem(f"{name} is missing")
             return None
         try:
-            values = np.asarray(zarr.open_array(str(self.path / name), mode="r", zarr_format=2)[:])
+            array = open_array(self.path, name)
+            values = np.asarray(array[:])
         except Exception as e:  # a damaged array may raise anything in zarr, numcodecs or json
-            self._problem(f"{name} cannot be read: {_one_line(e)}")
+            self._problem(f"{name} cannot be read: {one_line(e.__cause__ or e)}")
             return None
         if values.ndim == 0 or (name.startswith("meta/") and values.ndim != 1):
             self._problem(f"{name} has the shape {values.shape}")
             return None
+        self.missing += missing_chunks(self.path, name, array, len(values) if rows is None else rows)
         return values
 
 
@@ -222,12 +255,12 @@ def survey(path: Path) -> Survey:
 
     Raises StoreError only where no zarr group stands at `path`; any other damage is a problem of the survey.
     """
-    if not path.is_dir():
-        raise StoreError(f"no store at {path}: make one with 'manicm-ms collect ENV --out {path}'")
+    require_folder(path, f"make one with 'manicm-ms collect ENV --out {path}'")
+    if not (path / ".zattrs").is_file() and looks_like_dp3(path):
+        raise StoreError(
+            f"{path} is a store of DP3's layout: 'manicm-ms convert {path} --from dp3 --out OURS.zarr' makes it one of "
+            "ours, which can be inspected"
+        )
     if not (path / ".zgroup").is_file() and not (path / "meta").is_dir():
         raise StoreError(f"{path} is not a store of demonstrations (a zarr group of format 2)")
     return _Surveyor(path).run()
-
-
-def _one_line(error: Exception) -> str:
-    return " ".join(f"{type(error).__name__}: {error}".split())[:200]

@@ -16,6 +16,7 @@ from typing import Any
 from lightning_fabric import Fabric
 from rich.console import Console
 
+from manicm_ms.demos.remarks import training_remarks
 from manicm_ms.demos.stats import FieldStats, store_stats
 from manicm_ms.demos.store import DemoStore
 from manicm_ms.demos.windows import Windows
@@ -43,12 +44,14 @@ class Demos:
         stats: ranges of `point_cloud`, `agent_pos` and `action`.
         provenance: path, content hash, sizes, `demo_seeds` (the seed of each episode, so that an evaluation can
             tell what was seen), and the store's own provenance, JSON values.
+        remarks: what a user should know of them, one sentence each; see `demos.remarks`.
     """
 
     spec: EnvSpec
     windows: Windows
     stats: Mapping[str, FieldStats]
     provenance: dict[str, Any]
+    remarks: tuple[str, ...] = ()
 
 
 def read_demos(path: Path, chunk: ChunkSpec) -> Demos:
@@ -69,7 +72,7 @@ def read_demos(path: Path, chunk: ChunkSpec) -> Demos:
             "demo_seeds": store.seeds.tolist(),
             "collection": store.provenance,
         }
-        return Demos(store.spec, windows, stats, provenance)
+        return Demos(store.spec, windows, stats, provenance, tuple(training_remarks(store, chunk)))
 
 
 @dataclass(frozen=True)
@@ -116,6 +119,11 @@ class Session:
         line = command if command is not None else shlex.join([Path(sys.argv[0]).name, *sys.argv[1:]])
         fabric = make_fabric(place, used, num_devices)
         return cls(kind, Path(out), preset, used, seed, fabric, console or Console(stderr=True), line)
+
+    def show_remarks(self, demos: Demos) -> None:
+        """Say what a user should know of the demonstrations, a line each."""
+        for remark in demos.remarks:
+            self._say(f"{demos.provenance['path']}: {remark}")
 
     def complete(
         self,

@@ -79,6 +79,7 @@ def distill(
         console=console,
         command=command,
     )
+    session.show_remarks(demos)
 
     def build() -> tuple[PolicyObjective, Batches]:
         network = policy.network.to(session.fabric.device)

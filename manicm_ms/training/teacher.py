@@ -71,6 +71,7 @@ def train_teacher(
         console=console,
         command=command,
     )
+    session.show_remarks(demos)
 
     def build() -> tuple[PolicyObjective, Batches]:
         decay = PowerDecay(preset.ema_power, preset.ema_max_decay)

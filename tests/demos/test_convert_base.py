@@ -14,14 +14,13 @@ from store_samples import PROVENANCE, SPEC, episode, make_store
 
 from manicm_ms.cli import USER_ERROR, main
 from manicm_ms.demos.convert import EXPORTERS, IMPORTERS, convert, import_store
-from manicm_ms.demos.convert.base import MissingDependencyError
+from manicm_ms.demos.convert.base import MissingDependencyError, Tally
 from manicm_ms.demos.store import DemoStore
 from manicm_ms.errors import (
     ConfigError,
     ManicmError,
     NoSpaceError,
     OutputExistsError,
-    SpecMismatchError,
     StoreError,
     UnknownNameError,
 )
@@ -104,6 +103,7 @@ def test_what_appears_at_the_output_meanwhile_is_left_alone(store, tmp_path):
     def slowly(job):
         job.folder.mkdir()
         out.write_text("another's")
+        return Tally(episodes=1, frames=1)
 
     EXPORTERS.add("slow", slowly)
     try:
@@ -140,6 +140,8 @@ def test_the_command_line_takes_one_direction(store, tmp_path, capsys):
     assert "say one of --to {lerobot,maniskill,minari} and --from {dp3}" in told()
     assert "say one of" in told("--to", "minari", "--from", "dp3")
     assert "--num-points goes with --from" in told("--to", "minari", "--num-points", "3")
+    assert "--cloud-scale goes with --from" in told("--to", "minari", "--cloud-scale", "1")
+    assert "--action-scale goes with --from" in told("--to", "minari", "--action-scale", "1")
     assert "--task goes with --to" in told("--from", "dp3", "--task", "push")
     assert not (tmp_path / "out").exists()
 
@@ -174,8 +176,37 @@ def test_the_seeds_of_an_import_do_not_pass_for_the_simulators(tmp_path):
     assert_refused(tmp_path / "a.zarr", "maniskill", tmp_path / "ms", StoreError, "does not know its episodes' seeds")
 
 
-def test_import_refuses_the_env_of_a_store_of_ours(store, tmp_path):
-    with pytest.raises(SpecMismatchError, match="not of ur3e/slide-block"):
+def test_import_says_that_a_store_is_ours(store, tmp_path):
+    with pytest.raises(StoreError, match="is one of our own stores already"):
         import_store(store, "dp3", tmp_path / "a.zarr", env="ur3e/slide-block")
     assert not (tmp_path / "a.zarr").exists()
     assert np.all([p.name == "in" for p in tmp_path.iterdir()])
+
+
+def test_what_is_far_outside_is_said_of_what_is_written(tmp_path):
+    with DemoStore.create(tmp_path / "a.zarr", SPEC, PROVENANCE) as store:
+        store.append(episode(0, agent_pos=1000 * episode(0).agent_pos))
+
+    def keep(job):
+        job.folder.mkdir()
+        tally = Tally(notes=["mine"])
+        for one in job.episodes():
+            tally.add(one)
+        return tally
+
+    def drop(job):
+        job.folder.mkdir()
+        return Tally()
+
+    for name, writer in (("keep", keep), ("drop", drop)):
+        EXPORTERS.add(name, writer)
+    try:
+        notes = convert(tmp_path / "a.zarr", "keep", tmp_path / "out").notes
+        with pytest.raises(ManicmError, match=r"no episode came out of the conversion: .*none was not written"):
+            convert(tmp_path / "a.zarr", "drop", tmp_path / "none")
+    finally:
+        for name in ("keep", "drop"):
+            del EXPORTERS._entries[name]
+    assert notes[0] == "mine"
+    assert "likely millimetres" in notes[1]
+    assert not (tmp_path / "none").exists()

@@ -55,9 +55,10 @@ def test_minari_reads_what_the_store_holds(store, tmp_path, monkeypatch, dataset
 
 
 def test_minari_lists_what_the_command_line_wrote(store, tmp_path, monkeypatch, capsys):
-    monkeypatch.setenv("MINARI_DATASETS_PATH", str(tmp_path))
+    monkeypatch.setenv("MINARI_DATASETS_PATH", str(tmp_path / "sets"))
+    monkeypatch.chdir(tmp_path)
     with pytest.raises(SystemExit, match=r"^0$"):
-        main(["convert", str(store), "--to", "minari", "--out", str(tmp_path / "reach-v0")])
+        main(["convert", str(store), "--to", "minari", "--out", "sets/reach-v0"])  # a path from here
     assert "reach-v0: 3 episodes" in "".join(capsys.readouterr().out.split("\n"))
     assert list(minari.list_local_datasets()) == ["reach-v0"]
 

@@ -5,6 +5,7 @@ import json
 import re
 import shutil
 import struct
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -93,6 +94,7 @@ DAMAGES = {
     "torn attributes": (write(".zattrs", b'{"format": "manicm'), "attributes .* cannot be read"),
     "list attributes": (write(".zattrs", b"[1, 2]"), "not written by"),
     "foreign attributes": (write(".zattrs", b"{}"), "not written by"),
+    "lost file": (lambda path: (path / "data/action/1.0").unlink(), "1 chunk file is missing: data/action/1.0: lost"),
     "old attributes": (write(".zattrs", b'{"format": "manicm_ms demos 1", "env_spec": {}}'), "attributes .* damaged"),
 }
 
@@ -123,6 +125,57 @@ def test_many_damaged_episodes_are_counted(sound, tmp_path):
 
 def test_empty_store_is_a_problem(tmp_path):
     assert survey(make_store(tmp_path / "a.zarr")).problems == ["it holds no episode"]
+
+
+def remarks(path, capsys):
+    assert inspect(path, as_json=True) == 0
+    return json.loads(capsys.readouterr().out)["remarks"]
+
+
+def test_a_missing_file_of_a_store_that_may_have_left_it_out_is_a_remark(sound, tmp_path, capsys):
+    path = tmp_path / "a.zarr"
+    shutil.copytree(sound, path)
+    attributes = json.loads((path / ".zattrs").read_text())
+    assert attributes.pop("chunks") == "all written"
+    (path / ".zattrs").write_text(json.dumps(attributes))
+    assert remarks(path, capsys) == []
+    (path / "data/action/1.0").unlink()
+    (path / "data/state/0.0").unlink()
+    [said] = remarks(path, capsys)
+    assert said.startswith("2 chunk files are missing: data/state/0.0, data/action/1.0; zarr reads them as zeros")
+    with DemoStore.open(path) as store:
+        assert store.missing_files == ("data/state/0.0", "data/action/1.0")
+
+
+def test_values_far_outside_and_foreign_arrays_are_remarks(tmp_path, capsys):
+    path = tmp_path / "a.zarr"
+    with DemoStore.create(path, SPEC, PROVENANCE) as store:
+        given = episode(0, length=25)
+        given.agent_pos[:, 1] *= 1000
+        given.point_cloud[0, 0, 0] = 65.5
+        store.append(given)
+        store.append(episode(1, length=40))
+    zarr.open_group(str(path), mode="r+").create_array("data/extra", data=np.ones(3))
+    said = remarks(path, capsys)
+    for expected in (
+        r"point_cloud reaches 65.5 m, 0.0962 % of it beyond 10 m: likely stray readings of a camera",
+        r"y \(m\) of agent_pos reaches 9\d\d.*, over 10 m: likely millimetres",
+        r"not read: data/extra",
+        r"1 episode of 2 last up to 40 steps, toy/sample ends at 30: likely another control rate than its 20 Hz",
+    ):
+        assert any(re.search(expected, s) for s in said), (expected, said)
+    assert inspect(path, html=tmp_path / "page.html") == 0
+    assert "remark: not read: data/extra" in capsys.readouterr().out
+    assert "<li>not read: data/extra</li>" in (tmp_path / "page.html").read_text()
+
+
+@pytest.mark.filterwarnings("error")
+def test_the_page_of_a_coloured_store_warns_of_nothing(tmp_path):
+    spec = replace(SPEC, obs=replace(SPEC.obs, point_channels=6))
+    with DemoStore.create(tmp_path / "a.zarr", spec, PROVENANCE) as store:
+        clouds = np.random.default_rng(0).uniform(0, 1, (5, 16, 6)).astype("f4")
+        store.append(episode(0, length=5, point_cloud=clouds))
+    assert inspect(tmp_path / "a.zarr", html=tmp_path / "page.html") == 0
 
 
 def test_no_store(tmp_path):

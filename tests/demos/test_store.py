@@ -16,6 +16,7 @@ from store_samples import PROVENANCE, SPEC, episode, make_store, require_same
 
 from manicm_ms.demos.store import DemoStore, Episode
 from manicm_ms.errors import NoSpaceError, OutputExistsError, StoreError
+from manicm_ms.paths import exclusive_lock
 
 HERE = Path(__file__).parent
 SEEDS = (3, 1, 4, 15, 9, 2)
@@ -278,6 +279,52 @@ def test_damaged_chunk_is_named(tmp_path):
     chunk.write_bytes(chunk.read_bytes()[:100])
     with DemoStore.open(path) as store, pytest.raises(StoreError, match="data/point_cloud"):
         store.episode(0)
+
+
+def idle(seed, length):
+    """An episode of which zarr, left alone, would write nearly no file."""
+    return episode(
+        seed, length, agent_pos=np.zeros((length, 4), "f4"), action=np.zeros((length, 2), "f4"), success=False
+    )
+
+
+def test_every_chunk_has_a_file_and_one_that_is_lost_is_missed(tmp_path):
+    path = make_store(tmp_path / "a.zarr")
+    with DemoStore.open(path, "a") as store:  # chunks hold 30 frames
+        for length in (20, 10, 30, 5):
+            store.append(idle(0, length))
+    assert {p.name for p in (path / "data/action").glob("[0-9]*")} == {"0.0", "1.0", "2.0"}
+    with DemoStore.open(path, "a") as store:  # a cut leaves the files of what is committed
+        store._write_frames({f: getattr(idle(1, 60), f) for f in store.fields}, idle(1, 60))
+    with DemoStore.open(path, "a") as store:
+        assert store.missing_files == ()
+        assert not store.action.any()
+    for name in ("data/action/1.0", "data/point_cloud/0.0.0", "meta/success/0", "meta/seed/0"):
+        content = (path / name).read_bytes()
+        (path / name).unlink()
+        for mode in ("r", "a"):
+            with pytest.raises(StoreError, match=f"damaged: 1 chunk file is missing: {name}"):
+                DemoStore.open(path, mode)
+        (path / name).write_bytes(content)
+    DemoStore.open(path).close()
+
+
+@pytest.mark.filterwarnings("error")
+def test_zarr_finds_nothing_strange_in_a_store(tmp_path):
+    path = make_store(tmp_path / "a.zarr", SEEDS[:1])
+    with DemoStore.open(path, "a"):
+        assert {n for n, _ in zarr.open_group(str(path), mode="r").members(max_depth=None)} > {
+            "data/state",
+            "meta/seed",
+        }
+
+
+def test_the_lock_file_of_earlier_versions_is_heeded_and_removed(tmp_path):
+    path = make_store(tmp_path / "a.zarr", SEEDS[:1])
+    with exclusive_lock(path / ".lock", StoreError), pytest.raises(StoreError, match="being written by process"):
+        DemoStore.open(path, "a")
+    DemoStore.open(path, "a").close()
+    assert not (path / ".lock").exists()
 
 
 def big_episode(length):

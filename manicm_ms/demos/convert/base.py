@@ -12,6 +12,7 @@ from typing import Any, Protocol
 
 import numpy as np
 
+from manicm_ms.demos.remarks import store_remarks
 from manicm_ms.demos.store import DemoStore, Episode
 from manicm_ms.errors import ManicmError, NoSpaceError, OutputExistsError, StoreError
 from manicm_ms.paths import is_disk_full, require_free_space, sync_tree, temporary_folder
@@ -141,8 +142,9 @@ def convert(store: Path | str, to: str, out: Path | str, *, task: str | None = N
             )
         words = task or reader.spec.env_id.rpartition("/")[2].replace("-", " ")
         with fresh_folder(out) as folder:
-            done = export(Export(reader, folder, out, words))
-    return Converted(out, done.episodes, done.frames, tuple(done.notes))
+            done = _something(export(Export(reader, folder, out, words)), out)
+        remarks = store_remarks(reader)
+    return Converted(out, done.episodes, done.frames, (*done.notes, *remarks))
 
 
 def import_store(source: Path | str, format: str, out: Path | str, **options: Any) -> Converted:
@@ -159,7 +161,7 @@ def import_store(source: Path | str, format: str, out: Path | str, **options: An
     """
     read, out = IMPORTERS.get(format), Path(out)
     with fresh_folder(out) as folder:
-        done = read(Path(source), folder, **options)
+        done = _something(read(Path(source), folder, **options), out)
     return Converted(out, done.episodes, done.frames, tuple(done.notes))
 
 
@@ -204,6 +206,13 @@ class MissingDependencyError(ManicmError):
 
     def __init__(self, format: str, library: str, remedy: str) -> None:
         super().__init__(f"converting to {format!r} needs {library}, which is not installed: {remedy}")
+
+
+def _something(done: Tally, out: Path) -> Tally:
+    """Return what was written; raise ManicmError where that is nothing, before it becomes `out`."""
+    if not done.frames:
+        raise ManicmError(f"no episode came out of the conversion: {out} was not written")
+    return done
 
 
 def _taken(out: Path) -> OutputExistsError:

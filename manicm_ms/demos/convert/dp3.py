@@ -6,28 +6,25 @@ can be checked is checked; what cannot (frames, units, the meaning of entries) i
 
 from __future__ import annotations
 
-import json
-from collections.abc import Iterator
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-import zarr
 
 from manicm_ms.demos.convert.base import IMPORTERS, Tally
+from manicm_ms.demos.convert.raw_store import OPTIONAL, RawStore
+from manicm_ms.demos.convert.scales import Scales, decide
+from manicm_ms.demos.remarks import store_remarks
 from manicm_ms.demos.store import DemoStore, Episode
 from manicm_ms.envs.simulator import ENVS
-from manicm_ms.errors import ConfigError, SpecMismatchError, StoreError
+from manicm_ms.errors import ConfigError, SpecMismatchError
 from manicm_ms.paths import require_free_space
 from manicm_ms.point_cloud import sample_cloud
-from manicm_ms.progress import progress_of
 from manicm_ms.provenance import package_versions
 from manicm_ms.types import ActionSpec, EnvSpec, ObsSpec, require_compatible
 
-_ACTION_SLACK = 1e-5  # of rounding, beyond [-1, 1]
 _FRAME, _CONTROL_HZ = "world", 10.0
-_PICTURES = {"image": "img", "depth": "depth"}
 
 
 @dataclass(frozen=True)
@@ -40,6 +37,9 @@ class Dp3Options:
         colors: keep rgb, where the store has it.
         frame: frame of the clouds, one of `types.FRAMES`, only where `env` is None; "world" if not given.
         control_hz: actions per second, only where `env` is None; 10 if not given.
+        cloud_scale: metres of a unit of the clouds; None: metres, and clouds that cannot be are refused.
+        depth_scale: metres of a unit of the depth images; None: metres, and images that cannot be are left out.
+        action_scale: what actions are divided by, one number or one an entry; empty: they are in [-1, 1].
         command: command line, for the provenance.
     """
 
@@ -48,6 +48,9 @@ class Dp3Options:
     colors: bool = False
     frame: str | None = None
     control_hz: float | None = None
+    cloud_scale: float | None = None
+    depth_scale: float | None = None
+    action_scale: tuple[float, ...] = ()
     command: str = ""
 
     def __post_init__(self) -> None:
@@ -71,111 +74,37 @@ def read_dp3(source: Path, folder: Path, **options: Any) -> Tally:
     environment; ConfigError, UnknownNameError, NoSpaceError.
     """
     asked = Dp3Options(**options)
-    raw = _RawStore.open(source)
+    raw = RawStore.open(source)
     spec = _spec(raw, asked)
-    pictures = [name for name in _PICTURES if name in raw.arrays]
+    scales = decide(
+        raw, colors=asked.colors, cloud_scale=asked.cloud_scale, depth_scale=asked.depth_scale,
+        action_scale=asked.action_scale,
+    )  # fmt: skip
+    spec = _with_pictures(spec, raw)
+    pictures = [name for name in OPTIONAL if name in raw.arrays]
     frame_bytes = 4 * (spec.obs.num_points * spec.obs.point_channels + spec.obs.agent_pos_dim + spec.action.dim)
     require_free_space(folder, frame_bytes * raw.num_frames)
     tally = Tally(notes=["seeds and success are not known: seeds count down from -1, all count as solved", *raw.notes])
     with DemoStore.create(folder, spec, _provenance(raw, asked, spec), extras=pictures) as store:
         for number, (start, stop) in enumerate(raw.episodes()):
-            episode = _episode(raw, spec, number, start, stop, pictures)
+            episode = _episode(raw, spec, scales, number, start, stop, pictures)
             store.append(episode)
             tally.add(episode)
         store.note(attempts=tally.episodes)
+        tally.notes += [*store_remarks(store), *(_frame_remarks(store, asked.env) if asked.env else [])]
     return tally
 
 
-@dataclass
-class _RawStore:
-    """The arrays of a DP3 store, with their shapes checked against each other."""
-
-    path: Path
-    arrays: dict[str, zarr.Array]  # by the names of `Episode`
-    ends: np.ndarray
-    attributes: dict[str, Any]
-    notes: list[str] = field(default_factory=list)
-
-    @classmethod
-    def open(cls, path: Path) -> _RawStore:
-        """Open the store at `path` to read; raise StoreError where it is none or an array is missing or damaged."""
-        if not path.is_dir():
-            raise StoreError(f"no store at {path}: name a folder that DP3 or ManiCM wrote, by custom something.zarr")
-        names = {"point_cloud": "data/point_cloud", "agent_pos": "data/state", "action": "data/action"}
-        found = {field: _array(path, name) for field, name in names.items()}
-        ends = _array(path, "meta/episode_ends")
-        if missing := [n for n, a in ((*found.items(), ("meta/episode_ends", ends))) if a is None]:
-            wanted = ", ".join(names.get(n, n) for n in missing)
-            raise StoreError(f"{path} is not a store of DP3's layout, or it is damaged: {wanted} cannot be read")
-        arrays = {field: array for field, array in found.items() if array is not None}
-        assert ends is not None
-        raw = cls(path, arrays, _read(path, "meta/episode_ends", ends), _attributes(path))
-        raw._check()
-        raw._add_pictures()
-        return raw
-
-    @property
-    def num_frames(self) -> int:
-        return int(self.ends[-1])
-
-    def episodes(self) -> Iterator[tuple[int, int]]:
-        starts = np.concatenate([[0], self.ends[:-1]])
-        yield from progress_of(list(zip(starts.tolist(), self.ends.tolist(), strict=True)), f"convert {self.path.name}")
-
-    def read(self, field: str, start: int, stop: int) -> np.ndarray:
-        return _read(self.path, field, self.arrays[field], slice(start, stop))
-
-    def _check(self) -> None:
-        if self.ends.ndim != 1 or not len(self.ends):
-            raise StoreError(f"{self.path} holds no episodes: nothing to convert")
-        if (np.diff(self.ends.astype(np.int64), prepend=0) <= 0).any():
-            raise StoreError(f"{self.path} is damaged: meta/episode_ends does not grow")
-        for name, array in self.arrays.items():
-            axes = 3 if name == "point_cloud" else 2
-            if array.ndim != axes or array.dtype.kind not in "fiu":
-                raise StoreError(
-                    f"{self.path}: {name} is {array.shape} {array.dtype} where {axes} axes of numbers belong"
-                )
-            if array.shape[0] < self.num_frames:
-                raise StoreError(
-                    f"{self.path} is damaged: {name} has {array.shape[0]} frames where meta/episode_ends gives "
-                    f"{self.num_frames}"
-                )
-        if (channels := self.arrays["point_cloud"].shape[2]) not in (3, 6):
-            raise StoreError(f"{self.path}: points have {channels} channels; 3 (xyz) or 6 (xyz, rgb) can be read")
-        for name, array in self.arrays.items():  # zarr reads what is missing as zeros, without a word
-            lost = array.nchunks - array.nchunks_initialized
-            if lost and array.shape[0] == self.num_frames:  # longer ones may have been allocated ahead
-                raise StoreError(f"{self.path} is damaged: {lost} of {array.nchunks} files of {name} are missing")
-
-    def _add_pictures(self) -> None:
-        """Take up pictures of a form that our stores have; others are left out with a note."""
-        sizes: set[tuple[int, ...]] = set()
-        for name, disk in _PICTURES.items():
-            array = _array(self.path, f"data/{disk}")
-            if array is None:
-                continue
-            kind, axes = (("u",), 4) if name == "image" else (("f",), 3)
-            fits = array.dtype.kind in kind and array.ndim == axes and array.shape[0] >= self.num_frames
-            if fits and (name != "image" or array.shape[3] == 3) and (not sizes or array.shape[1:3] in sizes):
-                sizes.add(array.shape[1:3])
-                self.arrays[name] = array
-            else:
-                self.notes.append(f"data/{disk} is {array.shape} {array.dtype}, which our stores do not hold: left out")
-
-
-def _spec(raw: _RawStore, asked: Dp3Options) -> EnvSpec:
+def _spec(raw: RawStore, asked: Dp3Options) -> EnvSpec:
     """Return the spec of the new store: the environment's, or one made of shapes; refuse data that does not fit it."""
     channels = raw.arrays["point_cloud"].shape[2]
     if asked.colors and channels == 3:
         raise ConfigError(f"{raw.path} holds no colours: drop --colors")
     spec = _spec_of_shapes(raw, asked) if asked.env is None else ENVS.get(asked.env).spec
-    picture = raw.arrays.get("image", raw.arrays.get("depth"))
     obs = replace(
         spec.obs,
         num_points=asked.num_points or spec.obs.num_points,
         point_channels=6 if asked.colors else 3,
-        image_size=spec.obs.image_size if picture is None else (picture.shape[1], picture.shape[2]),
     )
     spec = replace(spec, obs=obs)
     for name, dim in (("agent_pos", spec.obs.agent_pos_dim), ("action", spec.action.dim)):
@@ -184,12 +113,28 @@ def _spec(raw: _RawStore, asked: Dp3Options) -> EnvSpec:
                 f"{raw.path} is not of {spec.env_id}: its {name} has {has} entries where {spec.env_id} has {dim}; "
                 "name the environment that it was collected in, or none"
             )
-    if "env_spec" in raw.attributes:  # a store of ours, or of a tool that kept our attributes
-        require_compatible(EnvSpec.from_dict(raw.attributes["env_spec"]), spec, str(raw.path), spec.env_id)
+    if (kept := _kept_spec(raw)) is not None:
+        require_compatible(kept, spec, str(raw.path), spec.env_id)
     return spec
 
 
-def _spec_of_shapes(raw: _RawStore, asked: Dp3Options) -> EnvSpec:
+def _kept_spec(raw: RawStore) -> EnvSpec | None:
+    """Return the spec that a tool took over from a store of ours with its attributes, or None."""
+    try:
+        return EnvSpec.from_dict(raw.attributes["env_spec"])
+    except (KeyError, TypeError, ValueError, AttributeError, ConfigError):  # none, or something else of that name
+        return None
+
+
+def _with_pictures(spec: EnvSpec, raw: RawStore) -> EnvSpec:
+    """Return the spec with the size of the pictures that are kept."""
+    picture = raw.arrays.get("image", raw.arrays.get("depth"))
+    if picture is None:
+        return spec
+    return replace(spec, obs=replace(spec.obs, image_size=(picture.shape[1], picture.shape[2])))
+
+
+def _spec_of_shapes(raw: RawStore, asked: Dp3Options) -> EnvSpec:
     dim, action_dim = raw.arrays["agent_pos"].shape[1], raw.arrays["action"].shape[1]
     return EnvSpec(
         env_id=f"dp3/{raw.path.name.removesuffix('.zarr')}",
@@ -200,21 +145,17 @@ def _spec_of_shapes(raw: _RawStore, asked: Dp3Options) -> EnvSpec:
     )
 
 
-def _episode(raw: _RawStore, spec: EnvSpec, number: int, start: int, stop: int, pictures: list[str]) -> Episode:
-    action = raw.read("action", start, stop).astype(np.float32)
-    if (reach := float(np.abs(action).max())) > 1 + _ACTION_SLACK:
-        raise SpecMismatchError(
-            f"{raw.path} is not of {spec.env_id}: an action of its episode {number} reaches {reach:.3g} where actions "
-            "are normalised to [-1, 1]; divide them by the controller's scale first, or name another environment"
-        )
-    clouds = raw.read("point_cloud", start, stop).astype(np.float32)[..., : 6 if spec.obs.point_channels == 6 else 3]
-    if spec.obs.point_channels == 6 and clouds[..., 3:].max() > 1:  # 0 to 255, as the simulators of DP3 give them
-        clouds[..., 3:] /= 255
+def _episode(
+    raw: RawStore, spec: EnvSpec, scales: Scales, number: int, start: int, stop: int, pictures: list[str]
+) -> Episode:
     extras: dict[str, Any] = {name: raw.read(name, start, stop) for name in pictures}
+    if "depth" in extras:
+        extras["depth"] = scales.depth(extras["depth"])
+    clouds = scales.cloud(raw.read("point_cloud", start, stop), spec.obs.point_channels)
     return Episode(
         point_cloud=np.stack([_resampled(cloud, spec.obs.num_points) for cloud in clouds]),
         agent_pos=raw.read("agent_pos", start, stop).astype(np.float32),
-        action=action.clip(-1, 1),
+        action=scales.actions(raw.read("action", start, stop)),
         seed=-1 - number,
         success=True,
         **extras,
@@ -226,7 +167,7 @@ def _resampled(cloud: np.ndarray, num_points: int) -> np.ndarray:
     return sample_cloud(cloud[cloud[:, :3].any(axis=1)], num_points)
 
 
-def _provenance(raw: _RawStore, asked: Dp3Options, spec: EnvSpec) -> dict[str, Any]:
+def _provenance(raw: RawStore, asked: Dp3Options, spec: EnvSpec) -> dict[str, Any]:
     points = raw.arrays["point_cloud"].shape[1]
     return {
         "env_id": spec.env_id,
@@ -236,29 +177,28 @@ def _provenance(raw: _RawStore, asked: Dp3Options, spec: EnvSpec) -> dict[str, A
         "source_attributes": raw.attributes,
         "points": f"{points} points of each frame resampled to {spec.obs.num_points} in farthest-point order",
         "assumed": "frame, units and meaning of entries as in env_spec; every episode solved",
+        "scales": {"cloud": asked.cloud_scale, "depth": asked.depth_scale, "action": list(asked.action_scale)},
         "command": asked.command,
         "versions": package_versions(),
     }
 
 
-def _array(path: Path, name: str) -> zarr.Array | None:
-    """Return an array of the store, or None where there is none that can be opened."""
+def _frame_remarks(store: DemoStore, env_id: str) -> list[str]:
+    """Return the remark about clouds that lie mostly outside of their environment's workspace, where it has one."""
+    from manicm_ms.envs.maniskill import workspace_of  # a simulator: seconds to import
+
     try:
-        return zarr.open_array(str(path / name), mode="r", zarr_format=2)
-    except Exception:  # zarr and json raise many kinds on what is not there or damaged
-        return None
-
-
-def _read(path: Path, name: str, array: zarr.Array, rows: slice = slice(None)) -> np.ndarray:
-    try:
-        return np.asarray(array[rows])
-    except Exception as error:  # what zarr and the codecs raise on a damaged chunk
-        raise StoreError(f"{path} is damaged: {name} cannot be read ({error})") from error
-
-
-def _attributes(path: Path) -> dict[str, Any]:
-    try:
-        attributes = json.loads((path / ".zattrs").read_text(encoding="utf-8"))
-    except (OSError, ValueError):
-        return {}
-    return attributes if isinstance(attributes, dict) else {}
+        box = workspace_of(env_id)
+    except ConfigError:  # the other suites' clouds are not cropped by one box
+        return []
+    inside, points = 0, 0
+    for number in range(len(store)):
+        xyz = store.episode(number).point_cloud[..., :3]
+        inside += int(((xyz > np.array(box.low)) & (xyz < np.array(box.high))).all(axis=-1).sum())
+        points += xyz[..., 0].size
+    if inside > points / 2:
+        return []
+    return [
+        f"{100 * inside / points:.2g} % of the points lie in the workspace of {env_id}, {box.low} to {box.high} m: "
+        "likely another frame, or clouds that are not cropped"
+    ]

@@ -16,6 +16,8 @@ from manicm_ms.demos.convert import child
 from manicm_ms.errors import ManicmError, NoSpaceError
 from manicm_ms.paths import is_disk_full
 
+_IMPORT_ERRORS = ("ImportError", "ModuleNotFoundError")
+
 
 class Writer:
     """The process that writes a data set, while the block lasts; a block without an error ends with the process.
@@ -32,9 +34,10 @@ class Writer:
     def __init__(self, format: str, python: str, root: Path, job: Mapping[str, Any]) -> None:
         self._format = format
         self._said: IO[bytes] = tempfile.TemporaryFile()  # noqa: SIM115  (__exit__ closes it; a pipe could fill up)
+        # Absolute: a library may join the path to another one, or work in a folder of its own.
         # -I: nothing of our environment, nor this folder, whose lerobot.py would stand before the library.
         self._process = subprocess.Popen(
-            [python, "-I", child.__file__, format, str(root)],
+            [python, "-I", child.__file__, format, str(root.absolute())],
             stdin=subprocess.PIPE,
             stdout=self._said,
             stderr=self._said,
@@ -71,4 +74,6 @@ class Writer:
         if is_disk_full(Exception(said)):
             return NoSpaceError(f"{self._format} found no space left: free some and give the same command")
         reason = said.splitlines()[-1].strip() if said else f"exit status {self._process.returncode}"
-        return ManicmError(f"{self._format} could not write the data set ({reason}): check that library's installation")
+        kind = reason.partition(":")[0]
+        remedy = "check that library's installation" if kind in _IMPORT_ERRORS else "try another --out, or report this"
+        return ManicmError(f"{self._format} could not write the data set ({reason}): {remedy}")
