@@ -54,6 +54,18 @@ class ActionError(ManicmError):
     """An action that has the wrong shape or is not finite."""
 
 
+class NotFiniteError(ManicmError):
+    """An observation that no policy can act on, or an action, that holds NaN or infinity.
+
+    Attributes:
+        rows: of the batch, those that are meant; the others are sound.
+    """
+
+    def __init__(self, message: str, rows: tuple[int, ...]) -> None:
+        super().__init__(message)
+        self.rows = rows
+
+
 class SpecMismatchError(ManicmError):
     """A data set, checkpoint or environment whose specs do not fit each other."""
 

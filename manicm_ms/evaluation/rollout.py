@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import torch
 
-from manicm_ms.errors import BackendError, ConfigError
+from manicm_ms.errors import BackendError, ConfigError, NotFiniteError
 from manicm_ms.types import ChunkSpec, require_compatible
 
 if TYPE_CHECKING:
@@ -243,7 +243,7 @@ class _Rollout:
         assert self.obs is not None
         device = self.policy.device
         obs = {key: value.to(device) for key, value in self.obs.items()}
-        actions = self.policy.act(obs, noise=self._noise().to(device))
+        actions = self._act(obs, self._noise().to(device))
         finite = torch.isfinite(actions).flatten(1).all(1).cpu()
         actions = torch.where(finite.to(device)[:, None, None], actions, torch.zeros_like(actions))
         played = actions.float().cpu().numpy()
@@ -255,6 +255,22 @@ class _Rollout:
             else:
                 self._end(i, False, f"the policy's action {len(episode.actions)} is not finite")
         return actions.to(self.env.device)
+
+    def _act(self, obs: Mapping[str, torch.Tensor], noise: torch.Tensor) -> torch.Tensor:
+        """Return the policy's actions (N, Ta, Da), NaN in rows that it refuses to act in."""
+        try:
+            return self.policy.act(obs, noise=noise)
+        except NotFiniteError as error:
+            refused = list(error.rows)
+        sound = next((i for i in range(len(self.rows)) if i not in refused), None)
+        if sound is None:
+            shape = (len(self.rows), self.policy.chunk.n_action_steps, self.policy.spec.action.dim)
+            return torch.full(shape, torch.nan, device=self.policy.device)
+        # A row does not depend on the others, so that a sound one can stand in for those that are refused.
+        rows = [sound if i in refused else i for i in range(len(self.rows))]
+        actions = self._act({key: value[rows] for key, value in obs.items()}, noise[:, rows]).clone()
+        actions[refused] = torch.nan
+        return actions
 
     def _noise(self) -> torch.Tensor:
         """Return noise (noise_draws, N, Tp, Da): row i of its episode's seed, zeros where there is no episode."""

@@ -86,6 +86,8 @@ class Policy(nn.Module, ABC):
 
         Raises:
             SpecMismatchError: the observations do not have the shapes of `spec` and `chunk`.
+            NotFiniteError: `agent_pos` or the action holds NaN or infinity, or a frame holds no finite point.
+                Single points that are not finite are left out; see `finite_obs`.
         """
 
     @property

@@ -23,7 +23,7 @@ from typing import Any
 import torch
 from safetensors import SafetensorError
 from safetensors.torch import load_file, save_file
-from torch import Tensor
+from torch import Tensor, nn
 
 from manicm_ms.errors import CheckpointError, ConfigError, ManicmError, NoSpaceError, OutputExistsError
 from manicm_ms.paths import is_disk_full, replaced_folder, require_free_space, set_aside, sha256, write_json, write_text
@@ -38,18 +38,19 @@ WEIGHTS_DTYPES = {"float32": torch.float32, "bfloat16": torch.bfloat16, "float16
 
 _CONFIG, _MODEL, _CARD, _MANIFEST = "config.json", "model.safetensors", "MODEL_CARD.md", "manifest.json"
 _FILES = (_CONFIG, _MODEL, _CARD)
-_NORMALIZER = ".normalizer."  # in a key: ranges of the data, which stay float32 in every checkpoint
+_COMPILED = "_orig_mod"  # name under which `torch.compile` holds the module that it wraps
 
 
 def save_checkpoint(policy: Policy, folder: Path, provenance: Mapping[str, Any], *, dtype: str = "float32") -> None:
     """Write `policy` to `folder`, in place of the checkpoint there, if any; a kill leaves the old or the new one.
 
     Args:
-        policy: teacher or student.
+        policy: teacher or student; what `torch.compile` wrapped, it or modules of it, is saved without the wrapping.
         folder: of the checkpoint.
         provenance: where it comes from, JSON values: data, preset, steps, seed, command, ...
         dtype: of the stored weights, a name in `WEIGHTS_DTYPES`; they are float32 again when loaded. float16
-            halves the file and keeps 11 significant bits. The normaliser always stays float32.
+            halves the file and keeps 11 significant bits. Only floating parameters are cast: buffers, such as the
+            normaliser's, keep their values.
 
     Raises:
         CheckpointError: the policy is a wrapper that no checkpoint can hold, or its weights are not finite.
@@ -57,7 +58,7 @@ def save_checkpoint(policy: Policy, folder: Path, provenance: Mapping[str, Any],
         OutputExistsError: the folder holds something other than a checkpoint.
         NoSpaceError: the disk is full; the old checkpoint stays.
     """
-    folder = Path(folder)
+    folder, policy = Path(folder), _unwrapped(policy)
     if not policy.registered:
         raise CheckpointError(f"{policy.name} is a wrapper around another policy: save that one")
     if dtype not in WEIGHTS_DTYPES:
@@ -155,20 +156,36 @@ def load_checkpoint(folder: Path, device: torch.device | str = "cpu") -> Policy:
             f"{path} does not fit the {policy.name} that {_CONFIG} describes ({len(wrong)} tensors differ, "
             f"first {wrong[0]}): the files come from different checkpoints"
         )
-    policy.load_state_dict({k: v.float() for k, v in tensors.items()})
+    policy.load_state_dict(tensors)  # each value takes the type of its place
     return policy.to(device).eval()
 
 
+def _unwrapped(policy: nn.Module) -> Policy:
+    """Return the policy that `torch.compile` wrapped, or the policy itself."""
+    policy = getattr(policy, "_modules", {}).get(_COMPILED, policy)
+    if not isinstance(policy, Policy):
+        raise CheckpointError(f"a {type(policy).__name__} is no policy of this package: save the policy that it wraps")
+    return policy
+
+
 def _stored(policy: Policy, dtype: torch.dtype) -> dict[str, Tensor]:
+    """Return name -> tensor on the CPU, under the names of the policy as `POLICIES` builds it."""
+    parameters = {key for key, _ in policy.named_parameters(remove_duplicate=False)}
     tensors = {}
     for key, value in policy.state_dict().items():
         if not torch.isfinite(value).all():
             raise CheckpointError(f"{key} of {policy.name} holds NaN or infinity: the training diverged, nothing saved")
-        kept = torch.float32 if _NORMALIZER in key else dtype
-        tensors[key] = value.detach().to("cpu", kept, copy=True).contiguous()
-        if not torch.isfinite(tensors[key]).all():
+        stored = value.detach().to("cpu", _stored_dtype(value, key in parameters, dtype), copy=True).contiguous()
+        if not torch.isfinite(stored).all():
             raise CheckpointError(f"{key} of {policy.name} overflows {dtype}: save with dtype 'float32' or 'bfloat16'")
+        tensors[".".join(part for part in key.split(".") if part != _COMPILED)] = stored
     return tensors
+
+
+def _stored_dtype(value: Tensor, is_parameter: bool, asked: torch.dtype) -> torch.dtype:
+    if not value.is_floating_point():
+        return value.dtype
+    return asked if is_parameter else torch.promote_types(value.dtype, torch.float32)
 
 
 def _manifest(folder: Path, policy: str, dtype: str, provenance: Mapping[str, Any]) -> dict[str, Any]:

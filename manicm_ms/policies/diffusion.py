@@ -14,6 +14,7 @@ from torch import Tensor
 from manicm_ms.errors import ConfigError
 from manicm_ms.policies.base import ChannelStats, Policy, check_obs, starting_noise
 from manicm_ms.policies.denoiser import ConditionedDenoiser
+from manicm_ms.policies.finite import finite_obs, require_finite_actions
 from manicm_ms.policies.normalizer import Normalizer
 from manicm_ms.registry import Registry
 from manicm_ms.types import ACTION, ChunkSpec, EnvSpec
@@ -280,7 +281,7 @@ class DiffusionPolicy(Policy):
         num_inference_steps: int | None = None,
     ) -> Tensor:
         """Choose the next actions; see `Policy.act`. `num_inference_steps` overrides the configured number."""
-        batch = check_obs(obs, self.spec, self.chunk)
+        batch, obs = check_obs(obs, self.spec, self.chunk), finite_obs(obs, self.spec)
         (start,) = starting_noise(self, batch, generator, noise)
         chunk = self.sample(self.network.encode_acting(obs, start), start, num_inference_steps)
         return executed_actions(self, chunk)
@@ -333,13 +334,14 @@ class OneStepTeacher(Policy):
         self, obs: Mapping[str, Tensor], *, generator: torch.Generator | None = None, noise: Tensor | None = None
     ) -> Tensor:
         """Choose the next actions; see `Policy.act`."""
-        batch = check_obs(obs, self.spec, self.chunk)
+        batch, obs = check_obs(obs, self.spec, self.chunk), finite_obs(obs, self.spec)
         (start,) = starting_noise(self, batch, generator, noise)
         last = torch.full((batch,), self.teacher.first_time, device=start.device)
         return executed_actions(self, self.teacher.predict_x0(start, last, self.network.encode_acting(obs, start)))
 
 
 class _HasNormalizer(Protocol):
+    name: str
     chunk: ChunkSpec
 
     @property
@@ -347,5 +349,10 @@ class _HasNormalizer(Protocol):
 
 
 def executed_actions(policy: _HasNormalizer, chunk: Tensor) -> Tensor:
-    """Return the executed part (B, Ta, Da) of a normalised chunk (B, Tp, Da), in env units clipped to [-1, 1]."""
-    return policy.normalizer.unnormalize(ACTION, chunk[:, policy.chunk.executed]).clamp(-1.0, 1.0)
+    """Return the executed part (B, Ta, Da) of a normalised chunk (B, Tp, Da), in env units clipped to [-1, 1].
+
+    Raises NotFiniteError where it holds NaN or infinity.
+    """
+    actions = policy.normalizer.unnormalize(ACTION, chunk[:, policy.chunk.executed])
+    require_finite_actions(actions, policy.name)
+    return actions.clamp(-1.0, 1.0)

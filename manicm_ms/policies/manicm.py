@@ -30,6 +30,7 @@ from manicm_ms.policies.consistency import (
 )
 from manicm_ms.policies.denoiser import ConditionedDenoiser, NetworkConfig
 from manicm_ms.policies.diffusion import PREDICTIONS, DiffusionConfig, DiffusionPolicy, Prediction, executed_actions
+from manicm_ms.policies.finite import finite_obs
 from manicm_ms.policies.normalizer import Normalizer
 from manicm_ms.types import ChunkSpec, EnvSpec
 
@@ -185,7 +186,7 @@ class ManiCM(Policy):
         self, obs: Mapping[str, Tensor], *, generator: torch.Generator | None = None, noise: Tensor | None = None
     ) -> Tensor:
         """Choose the next actions; see `Policy.act`."""
-        batch = check_obs(obs, self.spec, self.chunk)
+        batch, obs = check_obs(obs, self.spec, self.chunk), finite_obs(obs, self.spec)
         draws = starting_noise(self, batch, generator, noise)
         return executed_actions(self, self.sample(self.network.encode_acting(obs, draws[0]), draws))
 

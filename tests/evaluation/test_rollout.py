@@ -13,6 +13,7 @@ from manicm_ms.devices import torch_threads
 from manicm_ms.errors import BackendError, ConfigError, SpecMismatchError
 from manicm_ms.evaluation.rollout import MAX_RESTARTS, EpisodeResult, RestartableEnv, decision_noise, rollout
 from manicm_ms.policies.base import make_policy
+from manicm_ms.policies.finite import require_finite_actions
 from manicm_ms.policies.manicm import ManiCM
 from manicm_ms.types import ActionSpec, ChunkSpec
 
@@ -142,6 +143,21 @@ def test_an_action_that_is_not_finite_fails_its_episode_alone():
     failed = {r.seed for r in results if r.crashed is not None}
     assert failed == {s for s, x in starts.items() if x > 0.5}
     assert all("not finite" in r.crashed and not r.success for r in results if r.seed in failed)
+
+
+class Refusing(Proportional):
+    """Raises where an action is not finite, as the policies of the package do."""
+
+    def act(self, obs, *, generator=None, noise=None):
+        actions = super().act(obs, generator=generator, noise=noise)
+        require_finite_actions(actions, self.name)
+        return actions
+
+
+@pytest.mark.parametrize("nan_above", [0.5, -2.0])
+def test_a_policy_that_refuses_to_act_in_some_rows_acts_in_the_others(nan_above):
+    expected = rollout(PointMass(4), Proportional(nan_above=nan_above), SEEDS)
+    assert rollout(PointMass(4), Refusing(nan_above=nan_above), SEEDS) == expected
 
 
 def test_an_env_that_dies_is_rebuilt_and_the_episodes_in_flight_have_crashed():

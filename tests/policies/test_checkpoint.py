@@ -13,10 +13,11 @@ from safetensors.torch import load_file, save_file
 from manicm_ms.demos.stats import FieldStats
 from manicm_ms.errors import CheckpointError, ConfigError, OutputExistsError
 from manicm_ms.paths import set_aside, sha256
-from manicm_ms.policies.base import make_policy
+from manicm_ms.policies.base import POLICIES, make_policy
 from manicm_ms.policies.checkpoint import load_checkpoint, read_manifest, save_checkpoint
 from manicm_ms.policies.diffusion import OneStepTeacher
 from manicm_ms.policies.manicm import ManiCM
+from manicm_ms.policies.simple_dp3 import simple_dp3
 
 FILES = ("config.json", "model.safetensors", "MODEL_CARD.md")
 PROVENANCE = {"data": "data/slide_block.zarr", "preset": {"steps": 1500}, "seed": 3}
@@ -76,6 +77,64 @@ def test_half_precision_halves_the_file_and_keeps_the_normaliser(tmp_path, dtype
         assert torch.equal(value, again.normalizer.state_dict()[key])
     assert 0 < (act(again) - act(policy)).abs().max() < error
     assert read_manifest(tmp_path / "half")["weights_dtype"] == dtype
+
+
+class Extras(torch.nn.Module):
+    """Tensors of every kind under a name that means nothing."""
+
+    def __init__(self):
+        super().__init__()
+        self.register_buffer("count", torch.tensor([2**24 + 1, -3]))
+        self.register_buffer("mask", torch.tensor([True, False]))
+        self.register_buffer("mean", torch.tensor([1.0 + 2**-20]))
+        self.register_buffer("exact", torch.tensor([1.0 + 2**-40], dtype=torch.float64))
+        self.weight = torch.nn.Parameter(torch.tensor([1.0 + 2**-20]))
+        self.places = torch.nn.Parameter(torch.tensor([2**24 + 1]), requires_grad=False)
+
+
+def test_half_precision_casts_floating_parameters_only(tmp_path, monkeypatch):
+    """What a tensor is decides, not its name: a parameter of a normaliser is cast, a buffer elsewhere is not."""
+
+    def with_extras(config, spec, chunk):
+        policy = simple_dp3(config, spec, chunk)
+        policy.network.normalizer.extras, policy.network.unet.extras = Extras(), Extras()
+        return policy
+
+    monkeypatch.setitem(POLICIES._entries, "simple_dp3", with_extras)
+    policy = make_policy("simple_dp3", make_spec(), CHUNK, TINY, seed=0)
+    save_checkpoint(policy, tmp_path / "x", {}, dtype="float16")
+    again = load_checkpoint(tmp_path / "x")
+    for extras in (again.network.normalizer.extras, again.network.unet.extras):
+        assert extras.count.tolist() == [2**24 + 1, -3]
+        assert extras.places.tolist() == [2**24 + 1]
+        assert extras.mask.tolist() == [True, False]
+        assert extras.mean.item() == 1.0 + 2**-20
+        assert extras.exact.item() == 1.0 + 2**-40
+        assert extras.weight.item() == 1.0
+
+
+@pytest.mark.parametrize("part", ["policy", "network.unet", "network.encoder.points"])
+def test_a_compiled_policy_is_saved_as_what_it_wraps(tmp_path, part):
+    policy = ManiCM.from_teacher(teacher())
+    expected = act(policy)
+    save_checkpoint(policy, tmp_path / "plain", {}, dtype="float16")
+    if part == "policy":
+        compiled = torch.compile(policy, backend="eager")
+    else:
+        compiled = policy
+        parent, name = policy.get_submodule(part.rpartition(".")[0]), part.rpartition(".")[2]
+        setattr(parent, name, torch.compile(getattr(parent, name), backend="eager"))
+    save_checkpoint(compiled, tmp_path / "full", {})
+    assert torch.equal(act(load_checkpoint(tmp_path / "full")), expected)
+    save_checkpoint(compiled, tmp_path / "half", {}, dtype="float16")
+    hashes = [sha256(tmp_path / name / "model.safetensors") for name in ("plain", "half")]
+    assert hashes[0] == hashes[1]
+
+
+def test_what_is_no_policy_is_refused(tmp_path):
+    with pytest.raises(CheckpointError, match=r"a Sequential is no policy.*save the policy that it wraps"):
+        save_checkpoint(torch.nn.Sequential(teacher()), tmp_path / "x", {})
+    assert not (tmp_path / "x").exists()
 
 
 def test_the_manifest_tells_what_and_from_where(folder):

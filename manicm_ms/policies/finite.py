@@ -1,0 +1,110 @@
+"""Keeps numbers that are no numbers away from actions: bad points are left out, what cannot be mended is refused."""
+
+from __future__ import annotations
+
+import math
+import warnings
+from collections.abc import Mapping
+
+import torch
+from torch import Tensor
+
+from manicm_ms.errors import NotFiniteError
+from manicm_ms.types import AGENT_POS, POINT_CLOUD, EnvSpec
+
+_MOST_NAMED = 3  # entries of agent_pos, and rows, that a message lists
+
+
+def finite_obs(obs: Mapping[str, Tensor], spec: EnvSpec) -> Mapping[str, Tensor]:
+    """Return the observations with finite numbers only.
+
+    Depth cameras write NaN or infinity where they saw nothing, so such points are left out: the others keep their
+    order and fill the cloud again from the beginning, which an encoder that pools by maximum does not see (decision
+    0006). A state that holds such a number has no substitute.
+
+    Args:
+        obs: `point_cloud` (B, To, P, C) and `agent_pos` (B, To, D).
+        spec: the environment that they are of.
+
+    Returns:
+        `obs` itself where all is finite, which costs two sums; they wait for an accelerator, and are skipped while a
+        CUDA graph is recorded.
+
+    Raises:
+        NotFiniteError: `agent_pos` holds NaN or infinity, or a frame has no finite point; it names the rows.
+    """
+    cloud, state = obs[POINT_CLOUD], obs[AGENT_POS]
+    if _recorded(cloud):
+        return obs
+    if not _finite_sum(state):
+        _require_finite_state(state, spec)
+    return obs if _finite_sum(cloud) else {**obs, POINT_CLOUD: _without_bad_points(cloud)}
+
+
+def require_finite_actions(actions: Tensor, name: str) -> None:
+    """Raise NotFiniteError, naming the rows, where actions (B, ...) of the policy `name` hold NaN or infinity."""
+    if _recorded(actions) or _finite_sum(actions):
+        return
+    if rows := _rows(~torch.isfinite(actions)):
+        raise NotFiniteError(
+            f"{name} came to an action of NaN or infinity in {_shown('row', rows)}: its weights, or values of the "
+            "observation far outside those of its training, are to blame; look at agent_pos and its units",
+            rows,
+        )
+
+
+def _recorded(tensor: Tensor) -> bool:
+    return tensor.is_cuda and torch.cuda.is_current_stream_capturing()
+
+
+def _finite_sum(values: Tensor) -> bool:
+    """Return whether the sum is finite: False wherever one value is not, or where many large ones overflow it."""
+    return math.isfinite(values.sum().item())
+
+
+def _require_finite_state(state: Tensor, spec: EnvSpec) -> None:
+    bad = ~torch.isfinite(state)  # (B, To, D)
+    if not bad.any():
+        return
+    names = [spec.agent_pos_names[i] for i in bad.flatten(0, 1).any(0).nonzero().flatten().tolist()]
+    rows = _rows(bad)
+    raise NotFiniteError(
+        f"agent_pos holds {int(bad.sum())} values of NaN or infinity in {_shown('row', rows)} "
+        f"({_listed(names)}): no action can be chosen from it; read the robot's state again, or stop",
+        rows,
+    )
+
+
+def _without_bad_points(cloud: Tensor) -> Tensor:
+    good = torch.isfinite(cloud).all(-1)  # (B, To, P)
+    count = good.sum(-1, keepdim=True)  # (B, To, 1)
+    if rows := _rows(count == 0):
+        raise NotFiniteError(
+            f"point_cloud holds no finite point in a frame of {_shown('row', rows)}: "
+            "the camera sees nothing of the workspace; check its depth and its pose",
+            rows,
+        )
+    if not good.all():
+        # The text never changes, so that Python shows it once and not at each decision.
+        warnings.warn(
+            "points of NaN or infinity are left out of point_cloud: depth without a value?",
+            RuntimeWarning,
+            stacklevel=4,
+        )
+    order = (~good).int().argsort(dim=-1, stable=True)  # good points first, in their order
+    places = torch.arange(cloud.shape[2], device=cloud.device) % count
+    return cloud.gather(2, order.gather(2, places)[..., None].expand_as(cloud))
+
+
+def _rows(bad: Tensor) -> tuple[int, ...]:
+    """Return the rows of bad (B, ...) bool that hold a True."""
+    return tuple(bad.flatten(1).any(1).nonzero().flatten().tolist())
+
+
+def _shown(word: str, numbers: tuple[int, ...]) -> str:
+    return f"{word}{'s' if len(numbers) > 1 else ''} {_listed([str(n) for n in numbers])}"
+
+
+def _listed(names: list[str]) -> str:
+    more = f" and {len(names) - _MOST_NAMED} more" if len(names) > _MOST_NAMED else ""
+    return ", ".join(names[:_MOST_NAMED]) + more
