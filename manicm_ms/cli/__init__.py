@@ -47,7 +47,9 @@ def list_command(kind: tyro.conf.Positional[Literal["envs", "policies", "presets
     if tag is not None and kind != "envs":
         raise ConfigError(f"--tag selects environments, {kind} have no tags: use 'list envs --tag {tag}' or drop --tag")
     tables = {"envs": lambda: listing.envs(tag), "policies": listing.policies, "presets": listing.presets}
-    listing.console().print(tables[kind]())
+    where = listing.console()
+    for table in tables[kind]():
+        listing.show(table, where)
 
 
 def check_command(env_ids: tyro.conf.Positional[tuple[str, ...]], backend: Backend = "auto") -> int:

@@ -7,9 +7,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from rich.table import Table
-
-from manicm_ms.cli.listing import console
+from manicm_ms.cli.listing import Listing, console, show
 from manicm_ms.demos.collect import Collected, collect
 from manicm_ms.demos.expert_files import EXPERT_FILES, fetch
 from manicm_ms.demos.experts import EXPERTS
@@ -40,7 +38,7 @@ def collect_tagged(tag: str, out: Path | None, episodes: int, options: Mapping[s
     if options["style"] is not None:
         raise ConfigError("--style belongs to one environment: collect that one by its id")
     names = tagged(tag)
-    table = Table("env id", "attempts", "kept", "mean length", "seconds")
+    rows: list[tuple[str, ...]] = []
     failed: dict[str, str] = {}
     for number, env_id in enumerate(names, start=1):
         print(f"{number} of {len(names)}: {env_id}", flush=True)
@@ -56,8 +54,8 @@ def collect_tagged(tag: str, out: Path | None, episodes: int, options: Mapping[s
         with DemoStore.open(done.path) as store:
             length = f"{store.lengths.mean():.0f}"
         seconds = f"{time.perf_counter() - began:.0f}"
-        table.add_row(env_id, str(done.attempts), str(done.episodes), length, seconds)
-    console().print(table)
+        rows.append((env_id, str(done.attempts), str(done.episodes), length, seconds))
+    show(Listing(("env id", "attempts", "kept", "mean length", "seconds"), rows), console())
     if failed:
         first = next(iter(failed))
         raise ManicmError(f"{len(failed)} of {len(names)} were not collected: {', '.join(failed)}; {failed[first]}")
@@ -79,11 +77,9 @@ def experts(action: str, names: tuple[str, ...], source: Path | None) -> None:
         return
     if source is not None:
         raise ConfigError("--from goes with 'experts fetch': drop it")
-    table = Table("expert", "kept at", "licence", "source")
-    for name in chosen:
-        file = EXPERT_FILES.get(name)
-        table.add_row(name, str(file.path) if file.path.is_file() else "not fetched", file.licence, file.url)
-    console().print(table)
+    files = [EXPERT_FILES.get(name) for name in chosen]
+    rows = [(f.name, str(f.path) if f.path.is_file() else "not fetched", f.licence, f.url) for f in files]
+    show(Listing(("expert", "kept at", "licence", "source"), rows), console())
 
 
 def _fetch(names: Sequence[str], source: Path | None) -> None:

@@ -1,26 +1,67 @@
-"""Tables of what is registered, for `manicm-ms list`."""
+"""Tables of what is registered, for `manicm-ms list`, in the width that there is."""
 
 from __future__ import annotations
 
+import textwrap
+from collections.abc import Sequence
 from dataclasses import fields
+from typing import Any, NamedTuple
 
 from rich.console import Console
 from rich.table import Table
 
 from manicm_ms.errors import UnknownNameError
 
-_FILE_WIDTH = 160  # columns of a table that is not read on a terminal
+_FILE_WIDTH = 1000  # columns of what is not read on a terminal: a table takes as many as it needs
+_POLICIES = {
+    "dp3": "DP3's diffusion teacher: a U-Net of 512, 1024 and 2048 channels, evaluated 10 times a decision.",
+    "simple_dp3": "Simple DP3's diffusion teacher: the same with a U-Net of 128, 256 and 384 channels.",
+    "manicm": "ManiCM's student, distilled from either teacher: evaluated once a decision.",
+}
+_NONE = {"points": "all", "down_dims": "the policy's", "clip_norm": "no clipping"}
+"""What None means in a preset's field; elsewhere, that the field does not apply."""
+
+
+class Listing(NamedTuple):
+    """A table before it is laid out.
+
+    Attributes:
+        headers: of the columns.
+        rows: texts, as many as there are headers.
+        title: above the table, or empty.
+    """
+
+    headers: Sequence[str]
+    rows: Sequence[Sequence[str]]
+    title: str = ""
 
 
 def console() -> Console:
-    """Return standard output, wide enough for a table where it is a file."""
+    """Return standard output, wide enough for any table where it is a file."""
     found = Console()
     if not found.is_terminal:
         found.width = max(found.width, _FILE_WIDTH)
     return found
 
 
-def envs(tag: str | None = None) -> Table:
+def show(listing: Listing, where: Console) -> None:
+    """Print a table; where the terminal is too narrow, each row as its first text and the others in lines below it."""
+    table = Table(*listing.headers, title=listing.title or None, title_justify="left")
+    for row in listing.rows:
+        table.add_row(*row)
+    if where.measure(table, options=where.options.update(width=_FILE_WIDTH)).maximum <= where.width:
+        where.print(table)
+        return
+    lines = [f"{listing.title}:"] if listing.title else []
+    for name, *values in listing.rows:
+        pairs = zip(listing.headers[1:], values, strict=True)
+        told = values if len(values) == 1 else [f"{header} {value}" for header, value in pairs if value]
+        lines += [name, *textwrap.wrap("; ".join(told), where.width, initial_indent="  ", subsequent_indent="  ",
+                                       break_long_words=False, break_on_hyphens=False)]  # fmt: skip
+    where.print("\n".join(lines), markup=False, highlight=False, soft_wrap=True)
+
+
+def envs(tag: str | None = None) -> list[Listing]:
     """Return the environments, those carrying `tag` if it is given: shapes, rate, length, expert styles, tags.
 
     Raises UnknownNameError where no environment carries `tag`.
@@ -31,38 +72,41 @@ def envs(tag: str | None = None) -> Table:
     known_tags = {t for name in ENVS.names() for t in ENVS.tags(name)}
     if tag is not None and tag not in known_tags:
         raise UnknownNameError("tag", tag, known_tags)
-    table = Table("env id", "cloud", "agent_pos", "action", "Hz", "steps", "frame", "expert", "tags")
-    for column in table.columns[:2]:
-        column.no_wrap = True
+    rows = []
     for name in ENVS.names(tag):
         spec = ENVS.get(name).spec
         styles = getattr(EXPERTS.get(name), "styles", ("yes",)) if name in EXPERTS.names() else ("none",)
         cloud = f"{spec.obs.num_points}x{spec.obs.point_channels}"
         numbers = (spec.obs.agent_pos_dim, spec.action.dim, f"{spec.action.control_hz:g}", spec.max_episode_steps)
-        table.add_row(
-            name, cloud, *map(str, numbers), spec.obs.frame, ", ".join(styles), ", ".join(sorted(ENVS.tags(name)))
-        )
-    return table
+        tags = ", ".join(sorted(ENVS.tags(name)))
+        rows.append((name, cloud, *map(str, numbers), spec.obs.frame, ", ".join(styles), tags))
+    return [Listing(("env id", "cloud", "agent_pos", "action", "Hz", "steps", "frame", "expert", "tags"), rows)]
 
 
-def policies() -> Table:
-    """Return the policies with one line on each."""
+def policies() -> list[Listing]:
+    """Return the policies with one sentence on each."""
     from manicm_ms.policies.base import POLICIES
 
-    table = Table("policy", "what it is")
-    for name in POLICIES.names():
-        table.add_row(name, (POLICIES.get(name).__doc__ or "").strip().splitlines()[0])
-    return table
+    sentences = {name: (POLICIES.get(name).__doc__ or "").strip().partition("\n")[0] for name in POLICIES.names()}
+    return [Listing(("policy", "what it is"), [(name, _POLICIES.get(name, line)) for name, line in sentences.items()])]
 
 
-def presets() -> Table:
-    """Return the training presets, a column each, and their fields."""
+def presets() -> list[Listing]:
+    """Return the recipes of teachers and those of students, a column each, and their fields."""
     from manicm_ms.training.presets import STUDENT_PRESETS, TEACHER_PRESETS
 
-    recipes = {f"teacher {n}": TEACHER_PRESETS.get(n) for n in TEACHER_PRESETS.names()}
-    students = {f"student {n}": STUDENT_PRESETS.get(n) for n in STUDENT_PRESETS.names()}
-    names = dict.fromkeys(f.name for recipe in (*recipes.values(), *students.values()) for f in fields(recipe))
-    table = Table("field", *recipes, *students)
-    for name in names:
-        table.add_row(name, *(str(getattr(r, name, "")) for r in (*recipes.values(), *students.values())))
-    return table
+    teachers = {name: TEACHER_PRESETS.get(name) for name in TEACHER_PRESETS.names()}
+    students = {name: STUDENT_PRESETS.get(name) for name in STUDENT_PRESETS.names()}
+    return [_recipes("teacher presets", teachers), _recipes("student presets", students)]
+
+
+def _recipes(title: str, presets: dict[str, Any]) -> Listing:
+    names = dict.fromkeys(f.name for recipe in presets.values() for f in fields(recipe))
+    rows = [(name, *(_value(name, getattr(recipe, name, None)) for recipe in presets.values())) for name in names]
+    return Listing(("field", *presets), rows, title)
+
+
+def _value(name: str, value: Any) -> str:
+    if value is None:
+        return _NONE.get(name, "-")
+    return ", ".join(map(str, value)) if isinstance(value, tuple) else str(value)

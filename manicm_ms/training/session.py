@@ -75,6 +75,10 @@ def read_demos(path: Path, chunk: ChunkSpec) -> Demos:
         return Demos(store.spec, windows, stats, provenance, tuple(training_remarks(store, chunk)))
 
 
+_WORK = {"teacher": "train", "student": "distill"}
+"""What making one is called."""
+
+
 @dataclass(frozen=True)
 class Session:
     """One training: where it runs, what it makes and where that goes.
@@ -172,7 +176,7 @@ class Session:
                     self.fabric,
                     seed=self.seed,
                     console=self.console,
-                    title=f"{self.kind} {self.out.name}",
+                    title=f"{_WORK[self.kind]} {self.out.name}",
                     snapshots=self._snapshots(snapshots, len(data), objective, run, provenance),
                 )
             except KeyboardInterrupt:

@@ -216,7 +216,6 @@ def even_board(legacy):
         (even_board(False), even_board(True), "--legacy"),
         (even_board(True), even_board(False), "--no-legacy"),
         (replace(even_board(False), squares_x=8, squares_y=6), even_board(True), "--squares 6 8 --legacy"),
-        (replace(even_board(True), dictionary="5X5_50"), even_board(False), "--dictionary 4X4_50 --no-legacy"),
     ],
 )
 def test_the_board_that_is_shown_is_found_out(asked, shown, options):
