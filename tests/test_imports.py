@@ -15,7 +15,7 @@ SIMULATORS = {"sapien", "mani_skill", "mujoco", "metaworld", "mplib"}
 BASE = {
     "types", "errors", "registry", "paths", "point_cloud", "provenance", "devices", "seeds", "camera_model",
     "stereo_depth", "realism", "private_libraries", "progress", "camera_doubts",
-    "written_numbers",
+    "written_numbers", "signals",
 }  # fmt: skip
 
 # layer -> the parts of manicm_ms that it may import beside itself and the base

@@ -20,6 +20,7 @@ from pathlib import Path
 
 from rich.console import Console
 
+from manicm_ms import signals
 from manicm_ms.benchmark.jobs import Job, all_jobs
 from manicm_ms.benchmark.plan import Plan
 from manicm_ms.errors import ManicmError
@@ -154,9 +155,10 @@ def run_in_processes(plan: Plan, processes: int, report: Callable[[Sequence[Job]
     files = [logs / f"{os.getpid()}-{k}.log" for k in range(processes)]
     workers = [context.Process(target=_worker, args=(plan.to_json(), str(file)), daemon=False) for file in files]
     jobs = all_jobs(plan)
-    for worker in workers:
-        worker.start()
     try:
+        with signals.spared_children():  # Ctrl-C reaches this process alone, which passes it on once
+            for worker in workers:
+                worker.start()
         while any(worker.is_alive() for worker in workers):
             report([job for job in jobs if job.is_done()])
             workers[0].join(_POLL_S)
@@ -175,12 +177,13 @@ def run_in_processes(plan: Plan, processes: int, report: Callable[[Sequence[Job]
 
 def _stop(workers: Sequence[multiprocessing.process.BaseProcess]) -> None:
     """Ask the workers to save and end, and insist after a while."""
-    for worker in workers:
+    started = [worker for worker in workers if worker.pid]
+    for worker in started:
         if worker.is_alive() and worker.pid:
             with contextlib.suppress(ProcessLookupError):
                 os.kill(worker.pid, signal.SIGINT)
     until = time.monotonic() + _STOP_S
-    for worker in workers:
+    for worker in started:
         worker.join(max(until - time.monotonic(), 0.1))
         if worker.is_alive():
             worker.kill()
@@ -188,13 +191,14 @@ def _stop(workers: Sequence[multiprocessing.process.BaseProcess]) -> None:
 
 def _worker(plan_json: str, log: str) -> None:
     """What a process does."""
-    # A session of its own: Ctrl-C on the terminal reaches the parent alone, which passes it on once. A training saves
-    # at the first one and would be cut off by a second.
+    # A session of its own: a training saves at the first interrupt and would be cut off by a second from the terminal.
     os.setsid()
     signal.signal(signal.SIGINT, signal.default_int_handler)
     _end_with_parent()
-    with _console(Path(log)) as console, contextlib.suppress(KeyboardInterrupt):
-        work_off(Plan.from_json(plan_json), console)
+    with contextlib.suppress(KeyboardInterrupt), signals.stoppable():
+        signal.pthread_sigmask(signal.SIG_UNBLOCK, {signal.SIGINT})  # its start was spared; what came since, comes now
+        with _console(Path(log)) as console:
+            work_off(Plan.from_json(plan_json), console)
 
 
 @contextlib.contextmanager
@@ -210,12 +214,17 @@ def _console(log: Path) -> Iterator[Console]:
 
 
 def _end_with_parent() -> None:
-    """Interrupt this process when the one that started it ends, be it killed: nobody would stop it then."""
+    """Interrupt this process when the one that started it ends, be it killed: nobody would stop it then.
+
+    One that does not end in time is ended as it is: what it had finished is on disk.
+    """
     parent = multiprocessing.parent_process()
 
     def watch() -> None:
         if parent is not None:
             parent.join()
             os.kill(os.getpid(), signal.SIGINT)
+            time.sleep(_STOP_S)
+            os._exit(1)
 
     threading.Thread(target=watch, daemon=True).start()

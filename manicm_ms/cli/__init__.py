@@ -6,6 +6,11 @@ were stopped when the same command is given again.
 
 from __future__ import annotations
 
+from manicm_ms import signals
+
+signals.quiet_start(("manicm-ms", "-m"))  # before the imports, which take a while
+
+# ruff: noqa: E402
 import errno
 import shlex
 import sys
@@ -23,6 +28,7 @@ from manicm_ms.paths import is_disk_full, without_temporaries
 Backend = Literal["auto", "cpu", "gpu"]
 Command = Callable[..., int | None]
 USER_ERROR, INTERRUPTED = 2, 130
+_RESUMABLE = ("collect", "train", "distill", "evaluate", "benchmark")
 _CHECK_THE_PATH = "check the paths on the command line"
 _REMEDIES = {
     errno.EACCES: "name a place that you may read and write, or change its permissions",
@@ -421,17 +427,23 @@ _WITH_PRESET = {
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
-    """Run one command and exit with its status: 0 good, 1 a check failed, 2 a user error, 130 stopped by Ctrl-C."""
+    """Run one command and exit with its status.
+
+    It is 0 good, 1 a check failed, 2 a user error, 130 stopped by Ctrl-C, 143 by SIGTERM, 129 by SIGHUP.
+    """
     arguments = list(sys.argv[1:] if arguments is None else arguments)
     try:
-        code = _run(arguments)
+        with signals.stoppable():
+            code = _run(arguments)
     except ManicmError as error:
         code = _complain(str(error))
     except OSError as error:
         code = _complain(_explain(error))
-    except KeyboardInterrupt:
-        print("stopped; the same command goes on from here", file=sys.stderr)
-        code = INTERRUPTED
+    except KeyboardInterrupt as stop:
+        signals.settle()
+        goes_on = arguments[0] in _RESUMABLE if arguments else False
+        print("stopped; the same command goes on from here" if goes_on else "stopped", file=sys.stderr)
+        code = getattr(stop, "status", INTERRUPTED)
     sys.exit(code or 0)
 
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import functools
-import multiprocessing
 from collections.abc import Iterator
 from contextlib import contextmanager
 from typing import Any
@@ -11,19 +10,18 @@ from typing import Any
 import gymnasium
 import numpy as np
 import torch
-from gymnasium.vector import AsyncVectorEnv, AutoresetMode
-from gymnasium.vector.async_vector_env import AsyncState
 from numpy.typing import ArrayLike
 from torch import Tensor
 
+from manicm_ms.envs.main_script import NO_GUARD_STATUS, main_script, no_guard, require_importable_main
 from manicm_ms.envs.requests import Seeds
 from manicm_ms.envs.simulator import EnvEntry, SimulatorConfig
 from manicm_ms.envs.vector import Info, Obs, VecEnv
 from manicm_ms.envs.worker import FACTS, RowEnv
+from manicm_ms.envs.worker_pool import WorkerPool
 from manicm_ms.errors import BackendError, ManicmError
 from manicm_ms.types import ChunkSpec, EnvSpec
 
-_START_METHOD = "forkserver"  # fork hangs once a Vulkan or GL context exists in the parent
 _REAP_S = 0.2  # how long a worker's end may take to show after its pipe broke
 _DEAD_WORKER = (EOFError, BrokenPipeError, ConnectionResetError)
 
@@ -38,11 +36,15 @@ class CpuVecEnv(VecEnv):
     ) -> None:
         super().__init__(entry, spec, num_envs, config, chunk)
         self.device = torch.device("cpu")
-        multiprocessing.get_context(_START_METHOD).set_forkserver_preload([__name__, entry.module, *entry.preload])
+        require_importable_main()
         make = functools.partial(RowEnv, spec.env_id, entry.module, config, chunk)
-        self._workers = AsyncVectorEnv(
-            [make] * num_envs, context=_START_METHOD, autoreset_mode=AutoresetMode.DISABLED, copy=False
-        )
+        try:
+            self._workers = WorkerPool(make, num_envs, [__name__, entry.module, *entry.preload])
+        except _DEAD_WORKER as error:
+            raise BackendError(
+                f"the worker processes of {spec.env_id} could not be started, the server that forks them has ended: "
+                "run it again; 'manicm-ms doctor' tells whether the machine can simulate and render"
+            ) from error
         self._facts: list[dict[str, Any]] = [{} for _ in range(num_envs)]
         self._failure: str | None = None  # why no call can succeed any more
 
@@ -70,8 +72,6 @@ class CpuVecEnv(VecEnv):
     def close_extras(self, **kwargs: Any) -> None:
         """Stop the worker processes."""
         broken = self._failure is not None or not all(process.is_alive() for process in self._workers.processes)
-        if broken:
-            self._workers._state = AsyncState.DEFAULT  # else Gymnasium waits for an answer that never comes
         self._workers.close(terminate=broken)
 
     def _guarded(self, call: Any, *args: Any, **kwargs: Any) -> Any:
@@ -80,6 +80,9 @@ class CpuVecEnv(VecEnv):
             with _quiet_gymnasium():
                 return call(*args, **kwargs)
         except _DEAD_WORKER as error:
+            if NO_GUARD_STATUS in self._exit_codes().values():
+                self._failure = "worker processes could not import the script"
+                raise no_guard(main_script()) from None
             self._failure = f"{self._dead_workers()} of {self.env_spec.env_id} died"
             raise self._backend_error() from error
         except Exception as error:  # a worker that raised has ended
@@ -87,6 +90,9 @@ class CpuVecEnv(VecEnv):
             if isinstance(error, ManicmError):
                 raise
             raise self._backend_error() from error
+        except BaseException:  # Ctrl-C: answers may be under way that nobody will read
+            self._failure = f"a call of {self.env_spec.env_id} was interrupted"
+            raise
 
     def _require_sound(self) -> None:
         if self._failure is not None:
@@ -99,10 +105,14 @@ class CpuVecEnv(VecEnv):
         )
 
     def _dead_workers(self) -> str:
+        codes = self._exit_codes()
+        return f"worker processes {list(codes)} (exit codes {list(codes.values())})"
+
+    def _exit_codes(self) -> dict[int, int | None]:
+        """Return row -> exit code of the workers that have ended."""
         for process in self._workers.processes:
             process.join(_REAP_S)
-        codes = {k: process.exitcode for k, process in enumerate(self._workers.processes) if not process.is_alive()}
-        return f"worker processes {list(codes)} (exit codes {list(codes.values())})"
+        return {k: process.exitcode for k, process in enumerate(self._workers.processes) if not process.is_alive()}
 
     def _tensors(self, obs: dict[str, np.ndarray]) -> Obs:
         return {key: torch.from_numpy(values.copy()) for key, values in obs.items()}  # the workers' memory is reused
