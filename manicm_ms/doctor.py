@@ -72,7 +72,9 @@ def check_vulkan() -> Finding:
     """Render a tiny scene with SAPIEN in a process of its own."""
     outcome = vulkan.probe()
     if not outcome.works:
-        return Finding("Vulkan device", "fail", outcome.reason, f"{_REINSTALL}, which installs Mesa's lavapipe")
+        reason, _, remedy = outcome.reason.partition("; ")
+        theirs = remedy if remedy.startswith("unset") else ""
+        return Finding("Vulkan device", "fail", reason, theirs or f"{_REINSTALL}, which installs Mesa's lavapipe")
     software = "llvmpipe" in outcome.device
     if software and _nvidia_driver():
         return Finding(
@@ -94,7 +96,8 @@ def check_mujoco() -> Finding:
         return Finding(name, "warn", f"Adroit and Meta-World cannot be played: {reason}", _REINSTALL)
     outcome = mujoco_gl.probe()
     if not outcome.works:
-        return Finding(name, "fail", outcome.reason.partition(";")[0], mujoco_gl.REMEDY)
+        reason, _, remedy = outcome.reason.partition("; ")
+        return Finding(name, "fail", reason, remedy or mujoco_gl.REMEDY)
     return Finding(name, "ok", f"mujoco {_version('mujoco')}, {outcome.device}")
 
 

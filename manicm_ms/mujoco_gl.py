@@ -2,7 +2,8 @@
 
 MuJoCo reads MUJOCO_GL while it is imported and, left alone, takes GLFW, which needs a screen. `prepare` sets it to the
 first that this machine has: EGL (a GPU's, or Mesa's software renderer), else OSMesa, else "disabled": physics then
-works and rendering raises RenderDeviceError. A choice that the user made stays.
+works and rendering raises RenderDeviceError. A choice that the user made stays. One that cannot be used is an error
+where MuJoCo is to render, and nowhere else: `prepare_import` keeps mujoco's import from failing by it.
 
 Where `make setup` had no root to install an OpenGL with, it unpacked one into `.mujoco_gl/` and left a manifest,
 `.mujoco_gl/mujoco_gl.json`, which then comes first (paths relative to the folder)::
@@ -17,6 +18,7 @@ Run as a module, it ends with status 0 where EGL opens without a screen, else 1.
 
 from __future__ import annotations
 
+import contextlib
 import ctypes
 import importlib
 import json
@@ -40,6 +42,9 @@ REMEDY = "run 'make setup FORCE=1' in the repository, or as root 'apt install li
 _CONTEXTS = {"egl": "mujoco.egl", "osmesa": "mujoco.osmesa", "glfw": "mujoco.glfw"}
 _LIBRARIES = {"egl": ("libEGL.so.1",), "osmesa": ("libOSMesa.so.8", "libOSMesa.so.6")}
 _TRIAL = "manicm_ms.envs.mujoco_render"  # run as a module, it renders one tiny picture
+_PLATFORM_VARIABLE = "PYOPENGL_PLATFORM"
+_DEVICE_VARIABLE = "MUJOCO_EGL_DEVICE_ID"
+_DRIVER_VARIABLES = ("__EGL_VENDOR_LIBRARY_FILENAMES", "__EGL_VENDOR_LIBRARY_DIRS", "LIBGL_DRIVERS_PATH")
 _EGL_PLATFORM_DEVICE = 0x313F
 _MOST_DEVICES = 32
 
@@ -64,9 +69,43 @@ def prepare() -> str:
 
     Call it before mujoco is first imported. Calling twice is fine.
 
-    Raises RenderDeviceError where MUJOCO_GL names something else, or a library that is not here, and where the manifest
-    of a private OpenGL is broken.
+    Raises RenderDeviceError where MUJOCO_GL names something else, or a library that is not here, where
+    PYOPENGL_PLATFORM names another one, and where the manifest of a private OpenGL is broken.
     """
+    choice = _choose()
+    platform = os.environ.get(_PLATFORM_VARIABLE, "")
+    if choice in _LIBRARIES and platform.lower() not in ("", choice) and _CONTEXTS[choice] not in sys.modules:
+        raise RenderDeviceError(
+            f"{_PLATFORM_VARIABLE}={platform} keeps PyOpenGL from {choice}, which MuJoCo renders with here: unset it"
+        )
+    return choice
+
+
+def prepare_import() -> None:
+    """As `prepare`, but where that fails import mujoco without OpenGL: `make_context` will say why.
+
+    mujoco's import ends in an error of PyOpenGL's where a variable of the user's names what is not here, also for
+    programs that render nothing with it.
+    """
+    try:
+        prepare()
+    except RenderDeviceError:
+        named = os.environ.get(VARIABLE)
+        os.environ[VARIABLE] = DISABLED
+        try:
+            importlib.import_module("mujoco")
+        finally:
+            os.environ.pop(VARIABLE) if named is None else os.environ.update({VARIABLE: named})
+
+
+def spare_others() -> None:
+    """Call it before another library may import mujoco: a wrong value of the user's variables is then no error yet."""
+    if os.environ.get(VARIABLE) and "mujoco" not in sys.modules:
+        with contextlib.suppress(ImportError):  # MuJoCo is not installed
+            prepare_import()
+
+
+def _choose() -> str:
     # Threads of Mesa's rasteriser do not survive a fork, and are no faster at the size of an observation.
     os.environ.setdefault("LP_NUM_THREADS", "0")
     named = os.environ.get(VARIABLE, "").strip().lower()
@@ -91,10 +130,33 @@ def make_context(width: int, height: int) -> Any:
     if choice == DISABLED:
         raise RenderDeviceError(f"no OpenGL to render with: neither EGL nor OSMesa is here; {REMEDY}")
     try:
-        return importlib.import_module(_CONTEXTS[choice]).GLContext(width, height)
+        kind = importlib.import_module(_CONTEXTS[choice]).GLContext
+        if not hasattr(kind, "_context"):  # mujoco frees what was never made, and an error of that would be printed
+            kind._context = None
+        return kind(width, height)
     except Exception as error:  # PyOpenGL's and the driver's own kinds; what follows is the same for all
         lines = str(error).strip().splitlines() or [type(error).__name__]
-        raise RenderDeviceError(f"MuJoCo cannot render through {choice} ({lines[0]}); {REMEDY}") from error
+        raise RenderDeviceError(f"MuJoCo cannot render through {choice} ({lines[0]}); {_remedy()}") from error
+
+
+def _remedy() -> str:
+    """Return what to try where rendering fails: first without the variables that the user set, if there are any."""
+    ours = _private_environment()
+    theirs = [
+        f"{name}={os.environ[name]}"
+        for name in (_DEVICE_VARIABLE, *_DRIVER_VARIABLES)
+        if os.environ.get(name) and os.environ[name] != ours.get(name)
+    ]
+    return f"unset {' and '.join(theirs)}, or correct it" if theirs else REMEDY
+
+
+def _private_environment() -> dict[str, str]:
+    """Return the variables that a private OpenGL sets, none where there is no sound one."""
+    try:
+        where = private_libraries.folder(FOLDER_VARIABLE, ".mujoco_gl", MANIFEST)
+        return {} if where is None else _read_manifest(where / MANIFEST)[2]
+    except RenderDeviceError:
+        return {}
 
 
 def probe(timeout_s: float = 120) -> Probe:

@@ -31,6 +31,7 @@ MANIFEST = "vulkan.json"
 REMEDY = "run 'make setup FORCE=1' in the repository, or install an NVIDIA driver or Mesa's lavapipe 24.3 or newer"
 
 _DRIVER_VARIABLE = "VK_DRIVER_FILES"
+_FORMER_VARIABLE = "VK_ICD_FILENAMES"
 _PROBE_PIXELS = 8
 _PROBE_BOX_M = 0.1  # half size of the box that is looked at
 _PROBE_RANGE_M = 1.0  # camera to box centre
@@ -70,12 +71,38 @@ def prepare() -> None:
     if where is None:
         return
     driver, preload = _read_manifest(where / MANIFEST)
-    chosen = os.environ.get(_DRIVER_VARIABLE) or os.environ.get("VK_ICD_FILENAMES")
+    chosen = os.environ.get(_DRIVER_VARIABLE) or os.environ.get(_FORMER_VARIABLE)
     if chosen and chosen != driver:
         return
     _load(preload)
     os.environ[_DRIVER_VARIABLE] = driver
     warnings.filterwarnings("ignore", message="Failed to find system libvulkan")  # SAPIEN's own does as well
+
+
+def no_device(detail: str = "") -> RenderDeviceError:
+    """Return the error that says that SAPIEN has nothing to render with, and what to try.
+
+    Where the user named a driver, that is the likely cause: the variable is told with its value.
+    """
+    told = "no Vulkan device that SAPIEN can render with" + (f" ({detail})" if detail else "")
+    named = [f"{name}={os.environ[name]}" for name in (_DRIVER_VARIABLE, _FORMER_VARIABLE) if _is_theirs(name)]
+    if not named:
+        return RenderDeviceError(f"{told}: {REMEDY}; 'manicm-ms doctor' tells what is there")
+    gone = [p for value in named for p in value.partition("=")[2].split(os.pathsep) if p and not Path(p).exists()]
+    why = f", where {gone[0]} does not exist" if gone else ""
+    return RenderDeviceError(f"{told}: it was told to use {' and '.join(named)}{why}; unset it, or name another driver")
+
+
+def _is_theirs(variable: str) -> bool:
+    """Return whether the user set a variable that names a driver: neither set-up's driver nor SAPIEN's own."""
+    value = os.environ.get(variable)
+    if not value or "sapien" in Path(value).parts:
+        return False
+    try:
+        where = folder()
+        return where is None or value != _read_manifest(where / MANIFEST)[0]
+    except RenderDeviceError:
+        return True
 
 
 def _read_manifest(path: Path) -> tuple[str, list[str]]:
@@ -132,7 +159,7 @@ def render_device() -> str:
         camera.take_picture()
         position = camera.get_picture("Position")  # (H, W, 4), OpenGL camera frame: -z looks forward
     except RuntimeError as error:
-        raise RenderDeviceError(f"no Vulkan device that SAPIEN can render with ({error}): {REMEDY}") from error
+        raise no_device(str(error)) from error
     seen, true = -float(position[_PROBE_PIXELS // 2, _PROBE_PIXELS // 2, 2]), _PROBE_RANGE_M - _PROBE_BOX_M
     name = str(scene.render_system.device.name)
     if abs(seen - true) > 0.01:

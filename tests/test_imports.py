@@ -27,7 +27,7 @@ ALLOWED = {
     "vulkan": set(),
     "sapien_gpu": {"vulkan"},
     "mujoco_gl": set(),
-    "robots": {"vulkan"},
+    "robots": {"vulkan", "mujoco_gl"},
     "envs": {"robots", "tasks", "vulkan", "sapien_gpu", "mujoco_gl"},
     "tasks": {"envs", "robots", "demos", "vulkan", "mujoco_gl"},
     "demos": {"envs", "tasks"},

@@ -19,7 +19,7 @@ VENDOR = "__EGL_VENDOR_LIBRARY_FILENAMES"
 def private(tmp_path, monkeypatch) -> Path:
     """A folder with a manifest, used in a shell that names no OpenGL."""
     monkeypatch.setenv(mujoco_gl.FOLDER_VARIABLE, str(tmp_path))
-    for name in (mujoco_gl.VARIABLE, VENDOR):
+    for name in (mujoco_gl.VARIABLE, VENDOR, "PYOPENGL_PLATFORM"):  # mujoco's import sets the last
         monkeypatch.setenv(name, "")  # so that it is put back, whatever a test makes of it
         monkeypatch.delenv(name)
     (tmp_path / "vendor.json").touch()
@@ -136,3 +136,39 @@ def test_a_library_whose_name_is_loaded_is_not_loaded_again(tmp_path):
     loaded = Path("/proc/self/maps").read_text()
     assert paths[0] in loaded
     assert paths[1] not in loaded
+
+
+# ---- what the user's own variables do -------------------------------------------------------------------------------
+
+WRONG = {
+    "MUJOCO_GL": "no-such-gl",
+    "PYOPENGL_PLATFORM": "glx",
+    "MUJOCO_EGL_DEVICE_ID": "977",
+    VENDOR: "/gone/vendor.json",
+}
+
+
+def with_variable(name: str, *words: str) -> subprocess.CompletedProcess:
+    """Run Python where a variable of MuJoCo's or OpenGL's has a wrong value."""
+    env = {k: v for k, v in os.environ.items() if k not in WRONG and k != mujoco_gl.FOLDER_VARIABLE}
+    env |= {"MUJOCO_GL": "egl", name: WRONG[name]}
+    return subprocess.run([sys.executable, *words], env=env, capture_output=True, text=True, check=False)
+
+
+@pytest.mark.parametrize("name", WRONG)
+def test_a_wrong_variable_is_named_with_its_value_where_mujoco_renders(name):
+    done = with_variable(name, "-m", "manicm_ms.envs.mujoco_render")
+    assert done.returncode == 1
+    (line,) = done.stderr.strip().splitlines()
+    assert f"{name}={WRONG[name]}" in line
+    assert "unset" in line
+
+
+@pytest.mark.parametrize("package", ["envs", "robots", "tasks"])
+@pytest.mark.parametrize("name", ["MUJOCO_GL", "PYOPENGL_PLATFORM"])
+def test_a_wrong_variable_ends_nothing_that_renders_without_mujoco(name, package):
+    """ManiSkill imports mujoco, whose import would end in an error of PyOpenGL's; the variable stays as it was."""
+    code = f"import os, manicm_ms.{package}, mujoco; print(os.environ.get({name!r}), mujoco.mj_versionString())"
+    done = with_variable(name, "-c", code)
+    assert done.returncode == 0, done.stderr
+    assert done.stdout.startswith(f"{WRONG[name]} 3.")

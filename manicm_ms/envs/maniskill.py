@@ -24,7 +24,7 @@ from manicm_ms.envs.delay import ActionDelay  # noqa: E402
 from manicm_ms.envs.simulator import ENVS, Simulator, SimulatorConfig, StepResult  # noqa: E402
 from manicm_ms.envs.ur3e_tabletop import UR3eTabletopEnv  # noqa: E402
 from manicm_ms.envs.views import CameraView, IdealView, View  # noqa: E402
-from manicm_ms.errors import ConfigError, RenderDeviceError  # noqa: E402
+from manicm_ms.errors import ConfigError  # noqa: E402
 from manicm_ms.point_cloud import Box  # noqa: E402
 from manicm_ms.realism import RealismRows  # noqa: E402
 from manicm_ms.robots.ur3e_ag95 import TCP_STEP, opening_to_action  # noqa: E402
@@ -189,9 +189,7 @@ def _make(
     except RuntimeError as error:
         if not any(words in str(error) for words in _NO_VULKAN):
             raise
-        raise RenderDeviceError(
-            "SAPIEN found no Vulkan device to render with: run 'make setup' to install one, then 'manicm-ms doctor'"
-        ) from error
+        raise vulkan.no_device() from error
     return env.unwrapped  # type: ignore[return-value]
 
 

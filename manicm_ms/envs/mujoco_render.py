@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from manicm_ms import mujoco_gl
 from manicm_ms.errors import RenderDeviceError
 
-mujoco_gl.prepare()  # before mujoco is first imported
+mujoco_gl.prepare_import()  # before mujoco is first imported
 
 import mujoco  # noqa: E402
 

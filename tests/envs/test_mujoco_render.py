@@ -161,6 +161,7 @@ def test_egl_comes_first_then_osmesa(monkeypatch, egl, osmesa, choice):
     monkeypatch.setenv("MANICM_MS_MUJOCO_GL", "system")
     monkeypatch.setattr(mujoco_gl, "_egl_works", lambda: bool(egl))
     monkeypatch.setattr(mujoco_gl, "_library", lambda *names: "OSMesa" in names[0] and bool(osmesa))
+    monkeypatch.delenv("PYOPENGL_PLATFORM", raising=False)  # mujoco's import has set it here
     assert mujoco_gl.prepare() == choice
 
 
