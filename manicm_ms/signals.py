@@ -18,6 +18,7 @@ from types import FrameType
 from typing import Any
 
 STOPPING = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
+_AGAIN_S = 0.05
 _END_S = 5.0  # how long a child may take to end when asked, before it is killed
 
 
@@ -169,7 +170,10 @@ def _end_at_once(number: int, frame: FrameType | None) -> None:
 def _again(hook: Any) -> Any:
     def see(dropped: Any) -> None:
         if isinstance(dropped.exc_value, Stopped):
-            signal.raise_signal(dropped.exc_value.status - 128)
+            # A moment later: here, too, it would be dropped.
+            later = threading.Timer(_AGAIN_S, os.kill, (os.getpid(), dropped.exc_value.status - 128))
+            later.daemon = True
+            later.start()
         else:
             hook(dropped)
 
