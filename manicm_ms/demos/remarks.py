@@ -12,7 +12,7 @@ from collections.abc import Collection, Iterator, Mapping
 import numpy as np
 
 from manicm_ms.demos.store import OPTIONAL_FIELDS, STORE_ARRAYS, DemoStore
-from manicm_ms.demos.windows import window_index
+from manicm_ms.demos.windows import Windows, window_index
 from manicm_ms.demos.zarr_files import array_names, remark_missing
 from manicm_ms.types import ChunkSpec, EnvSpec
 
@@ -33,14 +33,20 @@ _BLOCK_FRAMES = 512
 _SMALLEST = 5e-3  # m; no cloud of a scene is smaller
 
 
-def store_remarks(store: DemoStore) -> list[str]:
-    """Return the remarks about a store: missing files, foreign arrays, and what `field_remarks` finds."""
+def store_remarks(store: DemoStore, frames: Mapping[str, np.ndarray] | None = None) -> list[str]:
+    """Return the remarks about a store: missing files, foreign arrays, and what `field_remarks` finds.
+
+    Args:
+        store: open.
+        frames: all frames of those fields that have been read already.
+    """
+    frames = frames or {}
     unread = set(array_names(store.path)) - STORE_ARRAYS
     remarks = [*remark_missing(store.missing_files), *unread_remarks(unread)]
     remarks += length_remarks(store.lengths, store.spec)
     for name in store.fields:
         if name != "image":
-            remarks += field_remarks(name, store.frames(name), store.spec)
+            remarks += field_remarks(name, frames[name] if name in frames else store.frames(name), store.spec)
     return remarks
 
 
@@ -73,6 +79,11 @@ def field_remarks(name: str, frames: np.ndarray, spec: EnvSpec) -> list[str]:
     return []
 
 
+def empty_clouds(clouds: np.ndarray) -> np.ndarray:
+    """Return which clouds of (F, P, C) hold nothing: all their points are equal; (F,) bool."""
+    return np.asarray((clouds[..., :3] == clouds[:, :1, :3]).all(axis=(1, 2)))
+
+
 def window_remarks(lengths: np.ndarray, chunk: ChunkSpec) -> list[str]:
     """Return the remarks about frames of episodes, (E,) control steps long, that no window of `chunk` reads."""
     remarks = []
@@ -92,9 +103,17 @@ def window_remarks(lengths: np.ndarray, chunk: ChunkSpec) -> list[str]:
     return remarks
 
 
-def training_remarks(store: DemoStore, chunk: ChunkSpec) -> list[str]:
-    """Return the remarks about a store that is to be learnt from: all of `store_remarks`, and what stays unused."""
-    remarks = [*store_remarks(store), *window_remarks(store.lengths, chunk)]
+def training_remarks(store: DemoStore, windows: Windows) -> list[str]:
+    """Return the remarks about a store that is learnt from: all of `store_remarks`, and what stays unused.
+
+    Args:
+        store: open.
+        windows: those of the store, in the CPU's memory.
+    """
+    read = {name: getattr(windows, name).numpy() for name in ("point_cloud", "agent_pos", "action")}
+    remarks = [*store_remarks(store, read), *window_remarks(store.lengths, windows.chunk)]
+    if empty := int(empty_clouds(read["point_cloud"]).sum()):
+        remarks.append(f"{_count(empty, 'frame')} of {len(windows.action)} with an empty cloud: 'inspect' names them")
     if failed := int((~store.successes).sum()):
         remarks.append(f"{_count(failed, 'episode')} of {len(store)} not solved, and learnt from all the same")
     if idle := [name for name in OPTIONAL_FIELDS if name in store.fields]:

@@ -472,7 +472,7 @@ class DemoStore:
         missing = [m for name, n in rows.items() for m in missing_chunks(self.path, name, self._array(name), n)]
         if missing and ALL_WRITTEN.items() <= self._attrs.items():
             raise StoreError(
-                f"{self.path} is damaged: {say_missing(missing)}; copy them from a backup, or collect again"
+                f"{self.path} is damaged: {say_missing(missing)}; bring them back, or collect into another folder"
             )
         return tuple(missing)
 
@@ -519,7 +519,7 @@ def _read_attrs(path: Path) -> dict[str, Any]:
             "of ours"
         )
     if not (path / ".zgroup").is_file() or not file.is_file():
-        raise StoreError(f"{path} is not a store of demonstrations (a zarr group of format 2 with attributes)")
+        raise StoreError(f"{path} is not a store of demonstrations, a zarr group of format 2: name another folder")
     if attrs.get("format") != FORMAT:
         raise StoreError(
             f"{path} has the format {attrs.get('format')!r} where this version reads {FORMAT!r}: "

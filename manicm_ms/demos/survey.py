@@ -13,7 +13,7 @@ from typing import Any
 
 import numpy as np
 
-from manicm_ms.demos.remarks import field_remarks, length_remarks, unread_remarks
+from manicm_ms.demos.remarks import empty_clouds, field_remarks, length_remarks, unread_remarks
 from manicm_ms.demos.store import FORMAT, FRAME_ARRAYS, STORE_ARRAYS, frame_shapes
 from manicm_ms.demos.zarr_files import (
     ALL_WRITTEN,
@@ -191,8 +191,8 @@ class _Surveyor:
         self._name_frames(f"NaN or infinity in {disk}", bad)
 
     def _empty_clouds(self, clouds: np.ndarray) -> None:
-        extent = np.ptp(clouds[..., :3], axis=1).max(axis=1)  # (F,)
-        self._name_frames("empty cloud (all points equal) in data/point_cloud", np.flatnonzero(extent == 0))
+        empty = np.flatnonzero(empty_clouds(clouds))
+        self._name_frames("empty cloud (all points equal) in data/point_cloud", empty)
 
     def _name_frames(self, what: str, frames: np.ndarray) -> None:
         """Name a problem per episode, with its first frame."""
@@ -262,5 +262,5 @@ def survey(path: Path) -> Survey:
             "ours, which can be inspected"
         )
     if not (path / ".zgroup").is_file() and not (path / "meta").is_dir():
-        raise StoreError(f"{path} is not a store of demonstrations (a zarr group of format 2)")
+        raise StoreError(f"{path} is not a store of demonstrations, a zarr group of format 2: name another folder")
     return _Surveyor(path).run()

@@ -72,7 +72,7 @@ def read_demos(path: Path, chunk: ChunkSpec) -> Demos:
             "demo_seeds": store.seeds.tolist(),
             "collection": store.provenance,
         }
-        return Demos(store.spec, windows, stats, provenance, tuple(training_remarks(store, chunk)))
+        return Demos(store.spec, windows, stats, provenance, tuple(training_remarks(store, windows)))
 
 
 _WORK = {"teacher": "train", "student": "distill"}

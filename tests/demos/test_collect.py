@@ -116,7 +116,7 @@ def test_bad_input(tmp_path):
     with pytest.raises(ConfigError, match="seed must not be negative"):
         collect(ENV_ID, 1, tmp_path / "new" / "a.zarr", seed=-1)
     (tmp_path / "notes.txt").write_text("not a store")
-    with pytest.raises(StoreError, match="not a store"):
+    with pytest.raises(StoreError, match=r"is not a store of demonstrations.*: name another folder"):
         collect(ENV_ID, 1, tmp_path)
     assert sorted(p.name for p in tmp_path.iterdir()) == ["notes.txt"]
 

@@ -1,11 +1,13 @@
 """DP3's stores become ours: hand-written ones, as DP3's collectors write them, and what they must not be."""
 
+import io
 import json
 from dataclasses import replace
 
 import numpy as np
 import pytest
 import zarr
+from rich.console import Console
 from store_samples import SPEC
 
 from manicm_ms.cli import main
@@ -207,7 +209,12 @@ def test_clouds_outside_of_the_workspace_are_said(tmp_path):
 
 def test_a_policy_trains_on_it(theirs, tmp_path):
     import_store(theirs, "dp3", tmp_path / "ours.zarr", env=ENV_ID)
+    with DemoStore.open(tmp_path / "ours.zarr", "a") as store:
+        store.append(replace(store.episode(0), success=False))
     small = {"batch_size": 8, "points": 16, "down_dims": (8, 16), "warmup_steps": 1}
     preset = replace(TEACHER_PRESETS.get("quick"), steps=4, **small)
-    checkpoint = train_teacher("simple_dp3", tmp_path / "ours.zarr", tmp_path / "run", preset, device="cpu")
+    console = Console(file=io.StringIO(), width=200)
+    ours = tmp_path / "ours.zarr"
+    checkpoint = train_teacher("simple_dp3", ours, tmp_path / "run", preset, device="cpu", console=console)
+    assert f"{ours}: 1 episode of 3 not solved, and learnt from all the same\n" in console.file.getvalue()
     assert load_checkpoint(checkpoint).spec.agent_pos_names == ENVS.get(ENV_ID).spec.agent_pos_names

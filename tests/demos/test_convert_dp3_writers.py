@@ -5,6 +5,7 @@ import pickle
 import re
 import shutil
 import warnings
+from pathlib import Path
 
 import numcodecs
 import numpy as np
@@ -16,6 +17,7 @@ from dp3_stores import ACTION_DIM, DIM, FRAMES, LENGTHS, POINTS, contents, rows,
 from manicm_ms.cli import USER_ERROR, main
 from manicm_ms.demos.convert import import_store
 from manicm_ms.demos.store import DemoStore
+from manicm_ms.demos.survey import survey
 from manicm_ms.errors import ConfigError, SpecMismatchError, StoreError
 
 CODINGS = {
@@ -319,9 +321,9 @@ def test_nothing_is_unpickled(tmp_path):
 def test_zipped_stores_and_files(tmp_path):
     source = write_dp3(tmp_path / "a.zarr")
     zipped = shutil.make_archive(str(source), "zip", source)
-    for open_it in (lambda p: import_store(p, "dp3", tmp_path / "o.zarr"), DemoStore.open):
+    for open_it in (lambda p: import_store(p, "dp3", tmp_path / "o.zarr"), DemoStore.open, survey):
         with pytest.raises(StoreError, match=r"is a zip file: unzip it \('python -m zipfile -e .*a.zarr'\)"):
-            open_it(zipped)
+            open_it(Path(zipped))
         (tmp_path / "file").write_text("mine")
         with pytest.raises(StoreError, match="file is a file where a store, which is a folder, is wanted"):
             open_it(tmp_path / "file")

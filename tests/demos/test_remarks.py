@@ -8,6 +8,7 @@ from store_samples import PROVENANCE, SPEC, episode, make_store
 
 from manicm_ms.demos.remarks import field_remarks, length_remarks, store_remarks, training_remarks, window_remarks
 from manicm_ms.demos.store import DemoStore
+from manicm_ms.demos.windows import Windows
 from manicm_ms.types import ChunkSpec
 
 RNG = np.random.default_rng(0)
@@ -105,14 +106,17 @@ def test_frames_that_no_window_reads(lengths, chunk, said):
 def test_a_store_that_is_learnt_from(tmp_path):
     sound = make_store(tmp_path / "a.zarr", (1, 2))
     with DemoStore.open(sound) as store:
-        assert store_remarks(store) == training_remarks(store, ChunkSpec()) == []
+        assert store_remarks(store) == training_remarks(store, Windows.from_store(store, ChunkSpec())) == []
     with DemoStore.create(tmp_path / "b.zarr", SPEC, PROVENANCE, extras=("image", "depth")) as store:
         for seed, length in ((0, 3), (1, 20)):
-            store.append(episode(seed, length, success=seed > 0))
-        remarks = training_remarks(store, ChunkSpec(2, 16, 8))
+            given = episode(seed, length, success=seed > 0)
+            given.point_cloud[0] = 0.25
+            store.append(given)
+        remarks = training_remarks(store, Windows.from_store(store, ChunkSpec(2, 16, 8)))
     assert [r.partition(":")[0] for r in remarks] == [
         "not learnt from",
         "no decision is learnt at the last 7 frames of each episode",
+        "2 frames of 23 with an empty cloud",
         "1 episode of 2 not solved, and learnt from all the same",
         "stored but not learnt from",
     ]
