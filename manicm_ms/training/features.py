@@ -11,7 +11,7 @@ from torch import Tensor
 from manicm_ms.demos.windows import Windows
 from manicm_ms.policies.denoiser import ConditionedDenoiser
 from manicm_ms.policies.points import POINT_CHOICES
-from manicm_ms.training.stream import step_generator
+from manicm_ms.training.stream import subset_generator
 from manicm_ms.types import ACTION, POINT_CLOUD
 
 COND = "cond"
@@ -70,7 +70,7 @@ def encode_windows(network: ConditionedDenoiser, windows: Windows, draws: int, s
         windows: of demonstrations.
         draws: K, point subsets for each window where the network reads fewer points than are stored: first one
             by its `acting_points`, then others by its `training_points`. There is one where no other can differ.
-        seed: decides the subsets.
+        seed: decides the subsets, by draws that no training step shares.
     """
     points, device = network.config.max_points, windows.action.device
     choices = [network.config.acting_points, *[network.config.training_points] * (draws - 1)]
@@ -80,7 +80,7 @@ def encode_windows(network: ConditionedDenoiser, windows: Windows, draws: int, s
     rows, actions = [], []
     for number, indices in enumerate(torch.arange(len(windows)).split(_BATCH)):
         batch = windows.batch(indices)
-        generator = step_generator(seed, number, 0, device)
+        generator = subset_generator(seed, number, device)
         subsets = [draw_points(batch, points, generator, choice) for choice in choices]
         rows.append(torch.stack([network.encode(subset) for subset in subsets], dim=1))  # (b, K, F)
         actions.append(network.normalizer.normalize(ACTION, batch[ACTION]))

@@ -45,6 +45,18 @@ class Objective(nn.Module, ABC):
     constant: ClassVar[tuple[str, ...]] = ()
     """Prefixes of `state_dict` names that training never changes; they are not saved with the training state."""
 
+    def train(self, mode: bool = True) -> Objective:
+        """Switch what is trained to training (dropout, statistics of batches) or evaluation; the rest to evaluation.
+
+        A frozen teacher, an average and a target network give what they give when they act.
+        """
+        super().train(mode)
+        for module in self.modules():
+            parameters = list(module.parameters())
+            if parameters and not any(p.requires_grad for p in parameters):
+                module.eval()
+        return self
+
     @abstractmethod
     def forward(self, batch: Mapping[str, Tensor], generator: torch.Generator) -> Tensor:
         """Return the loss of a batch, a scalar."""

@@ -21,7 +21,7 @@ from manicm_ms.demos.stats import FieldStats, store_stats
 from manicm_ms.demos.store import DemoStore
 from manicm_ms.demos.windows import Windows
 from manicm_ms.devices import resolve_device
-from manicm_ms.errors import CheckpointError, OutputExistsError
+from manicm_ms.errors import CheckpointError, ConfigError, OutputExistsError, require_at_least
 from manicm_ms.policies.checkpoint import read_manifest, save_checkpoint
 from manicm_ms.training.device import make_fabric, resolve_precision
 from manicm_ms.training.loop import Batches, FitResult, Snapshots, fit
@@ -117,7 +117,16 @@ class Session:
         console: Console | None,
         command: str | None,
     ) -> Session:
-        """Resolve device and precision and launch the processes; raise ConfigError where they do not exist."""
+        """Resolve device and precision and launch the processes.
+
+        Raises ConfigError where they do not exist, or where the devices cannot share a batch equally.
+        """
+        require_at_least(1, num_devices=num_devices)
+        if preset.batch_size % num_devices:
+            raise ConfigError(
+                f"batch_size={preset.batch_size} cannot be shared equally by num_devices={num_devices}: "
+                f"use batch_size={-(-preset.batch_size // num_devices) * num_devices}, or fewer devices"
+            )
         place = resolve_device(device)
         used = resolve_precision(precision, place)
         line = command if command is not None else shlex.join([Path(sys.argv[0]).name, *sys.argv[1:]])

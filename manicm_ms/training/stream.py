@@ -6,7 +6,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-_INDICES, _NOISE = 0, 1  # branches of the seed, so that the two streams are independent
+_INDICES, _NOISE, _SUBSETS = 0, 1, 2  # branches of the seed, so that the streams are independent
 
 
 class IndexStream:
@@ -44,5 +44,14 @@ class IndexStream:
 
 def step_generator(seed: int, step: int, rank: int, device: torch.device | str) -> torch.Generator:
     """Return the generator, on `device`, of all noise that `rank` draws in `step`."""
-    (state,) = np.random.SeedSequence([_NOISE, seed, step, rank]).generate_state(1, np.uint64)
+    return _generator(device, _NOISE, seed, step, rank)
+
+
+def subset_generator(seed: int, block: int, device: torch.device | str) -> torch.Generator:
+    """Return the generator, on `device`, of the point subsets that are encoded before training, block by block."""
+    return _generator(device, _SUBSETS, seed, block)
+
+
+def _generator(device: torch.device | str, *key: int) -> torch.Generator:
+    (state,) = np.random.SeedSequence(key).generate_state(1, np.uint64)
     return torch.Generator(device).manual_seed(int(state) >> 1)  # manual_seed takes 63 bits without wrapping

@@ -23,6 +23,7 @@ from manicm_ms.training.objectives import (
     PublicConsistencyDistillation,
 )
 from manicm_ms.training.optim import PowerDecay
+from manicm_ms.training.stream import step_generator, subset_generator
 from manicm_ms.types import ChunkSpec
 
 CHUNK = ChunkSpec()
@@ -233,6 +234,40 @@ def test_only_the_unet_of_the_student_is_trained(store, windows):
     features = encode_windows(teacher.network, windows, 1, 0)
     objective(features.batch(torch.arange(8)), generator()).backward()
     assert all(objective.get_parameter(k).grad is not None for k in trained)
+
+
+class NoisyDenoiser(TimeTable):
+    """A denoiser with a layer that behaves otherwise in training, in the encoder and beside it."""
+
+    def __init__(self, factors):
+        super().__init__(factors)
+        self.encoder = nn.Sequential(nn.Linear(1, 1), nn.Dropout(0.5))
+        self.unet = nn.Sequential(nn.Linear(1, 1), nn.Dropout(0.5))
+
+
+def test_training_switches_only_what_is_trained(store):
+    chunk, diffusion = ChunkSpec(1, 1, 1), DiffusionConfig()
+    teacher = DiffusionPolicy("noisy", NoisyDenoiser(torch.ones(100)), store.spec, chunk, diffusion)
+    teacher.eval()
+    student = ManiCM(NoisyDenoiser(torch.ones(100)), store.spec, chunk, diffusion, ConsistencyConfig())
+    learning = DiffusionObjective(teacher, None, PowerDecay()).train()
+    assert all(m.training for m in learning.policy.modules())
+    assert not any(m.training for m in learning.average.modules())
+    distilling = ConsistencyDistillation(teacher, student, mu=0.95).train()
+    frozen = (distilling.teacher, distilling.target, distilling.student.network.encoder)
+    assert not any(m.training for part in frozen for m in part.modules())
+    assert all(m.training for m in distilling.student.network.unet.modules())
+    assert not any(m.training for m in distilling.eval().modules())
+
+
+def test_encoded_subsets_are_not_those_of_the_first_training_step(store, windows):
+    network = small_policy(store, max_points=16).network
+    features = encode_windows(network, windows, draws=2, seed=0).cond[:, 1]
+    everything = windows.batch(torch.arange(len(windows)))
+    shared = network.encode(draw_points(everything, 16, step_generator(0, 0, 0, "cpu")))
+    own = network.encode(draw_points(everything, 16, subset_generator(0, 0, "cpu")))
+    torch.testing.assert_close(features, own)
+    assert not torch.allclose(features, shared)
 
 
 def test_each_row_sees_one_of_its_subsets(store, windows):

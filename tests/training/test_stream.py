@@ -3,7 +3,7 @@
 import pytest
 import torch
 
-from manicm_ms.training.stream import IndexStream, step_generator
+from manicm_ms.training.stream import IndexStream, step_generator, subset_generator
 
 
 @pytest.mark.parametrize(("size", "batch"), [(10, 4), (7, 7), (3, 8), (100, 1)])
@@ -43,3 +43,12 @@ def test_noise_is_a_function_of_seed_step_and_rank():
     assert torch.equal(draw(0, 5, 0), draw(0, 5, 0))
     others = [draw(0, 5, 0), draw(1, 5, 0), draw(0, 6, 0), draw(0, 5, 1)]
     assert len({tuple(o.tolist()) for o in others}) == 4
+
+
+def test_encoding_shares_no_draw_with_training():
+    """It once drew the subsets of block k from the generator of step k, whose first draw picks among the subsets."""
+    steps = {step_generator(3, step, 0, "cpu").initial_seed() for step in range(200)}
+    blocks = [subset_generator(3, block, "cpu").initial_seed() for block in range(200)]
+    assert len(set(blocks)) == 200
+    assert not steps & set(blocks)
+    assert subset_generator(3, 7, "cpu").initial_seed() == blocks[7] != subset_generator(4, 7, "cpu").initial_seed()

@@ -190,6 +190,19 @@ def test_skip_must_divide_the_timesteps(pair, tmp_path):
         run(distill, pair[2], pair[1], tmp_path / "out", replace(STUDENT, skip=7))
 
 
+@pytest.mark.parametrize(
+    ("num_devices", "match"),
+    [(3, r"batch_size=32 cannot be shared equally by num_devices=3: use batch_size=33"), (0, "num_devices"),
+     (64, "use batch_size=64")],
+)  # fmt: skip
+def test_devices_that_cannot_share_a_batch_are_refused_before_any_process_starts(pair, tmp_path, num_devices, match):
+    with pytest.raises(ConfigError, match=match):
+        run(train_teacher, "simple_dp3", pair[1], tmp_path / "t", TEACHER, num_devices=num_devices)
+    with pytest.raises(ConfigError, match=match):
+        run(distill, pair[2], pair[1], tmp_path / "s", STUDENT, num_devices=num_devices)
+    assert list(tmp_path.iterdir()) == []
+
+
 def test_epsilon_prediction_and_the_public_formula_train_too(pair, tmp_path):
     _, data, *_ = pair
     out, _ = run(
