@@ -5,6 +5,7 @@ from __future__ import annotations
 import threading
 import time
 from collections.abc import Callable, Iterable, Iterator, Sequence
+from contextlib import contextmanager
 from datetime import timedelta
 from typing import TypeVar
 
@@ -48,6 +49,24 @@ def progress_of(items: Sequence[T], description: str, console: Console | None = 
     """Yield `items`, showing how many are done; by default on standard output."""
     with progress_bars(console or Console()) as shown:
         yield from shown.track(items, description=description, total=len(items))
+
+
+@contextmanager
+def working(console: Console | None, description: str) -> Iterator[None]:
+    """Show on `console` that work without a count goes on; nothing is left of it on a terminal, nor of short work.
+
+    Args:
+        console: where; None shows nothing.
+        description: of the work.
+    """
+    if console is not None and (console.is_terminal or console.is_jupyter):
+        columns = (TextColumn("{task.description}"), BarColumn(), TimeElapsedColumn())
+        shown = Progress(*columns, console=console, transient=True, refresh_per_second=1)
+    else:
+        shown = progress_bars(console)
+    with shown:
+        shown.add_task(description, total=None)
+        yield
 
 
 class LineProgress(Progress):
@@ -111,7 +130,8 @@ class LineProgress(Progress):
                     self._finished.add(task.id)
 
     def _line(self, task: Task) -> str:
-        parts = [task.description, *(str(column(task)).strip() for column in self._told)]
+        told = self._told if task.total is not None or task.completed else ()  # of what is not counted, nothing
+        parts = [task.description, *(str(column(task)).strip() for column in told)]
         parts.append(f"{_clock_face(task.elapsed or 0)} passed")
         if not task.finished and task.time_remaining is not None:
             parts.append(f"{_clock_face(task.time_remaining)} left")

@@ -10,7 +10,7 @@ import pytest
 from rich.console import Console
 from rich.progress import Progress, TextColumn
 
-from manicm_ms.progress import PERIOD_S, LineProgress, progress_bars, progress_of
+from manicm_ms.progress import PERIOD_S, LineProgress, progress_bars, progress_of, working
 
 
 @pytest.fixture
@@ -86,6 +86,22 @@ def test_terminals_get_bars_and_none_shows_nothing():
     assert isinstance(progress_bars(Console(file=file)), LineProgress)
     with progress_bars(None) as shown:
         shown.add_task("quiet", total=1)
+
+
+def test_work_without_a_count_is_told_while_it_lasts():
+    file, clock = io.StringIO(), SimpleNamespace(now=0.0)
+    with LineProgress([TextColumn("never")], Console(file=file), clock=lambda: clock.now) as shown:
+        shown.add_task("time the decisions", total=None)
+        clock.now = 30.0
+        shown.tick()
+    assert file.getvalue() == "time the decisions  0:00:30 passed\n"
+    with working(Console(file=file), "short work"), working(None, "quiet work"):
+        pass
+    assert "work" not in file.getvalue()
+    screen = Console(file=io.StringIO(), force_terminal=True, width=80)
+    with working(screen, "time the decisions"):
+        pass
+    assert "time the decisions" in screen.file.getvalue()
 
 
 def test_items_pass_through_and_are_counted():

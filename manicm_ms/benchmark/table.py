@@ -19,6 +19,7 @@ from manicm_ms.evaluation.latency import measure_latency
 from manicm_ms.evaluation.machine import machine
 from manicm_ms.evaluation.statistics import compare_paired, mean_of_highest, mean_rate_interval, wilson_interval
 from manicm_ms.paths import write_json
+from manicm_ms.progress import working
 from manicm_ms.provenance import package_versions
 
 SCHEMA_VERSION = 1
@@ -50,7 +51,8 @@ def measure_decisions(plan: Plan, console: Console, repetitions: int = 30) -> No
         except ManicmError as error:
             console.print(f"{env_id}: decisions not timed: {error}", style="yellow", markup=False, highlight=False)
             continue
-        measured = measure_latency(policies, repetitions=repetitions)
+        with working(console, f"time the decisions of {env_id}"):
+            measured = measure_latency(policies, repetitions=repetitions)
         times = {name: latency._asdict() for name, latency in measured.items()}
         write_json(path, {"machine": machine(), "methods": times})
 

@@ -25,7 +25,7 @@ from manicm_ms.evaluation.rollout import EpisodeResult, RestartableEnv, rollout
 from manicm_ms.evaluation.statistics import compare_paired, success_rate
 from manicm_ms.evaluation.video import Take, choose_seeds, film
 from manicm_ms.paths import sha256, write_json
-from manicm_ms.progress import progress_bars
+from manicm_ms.progress import progress_bars, working
 from manicm_ms.provenance import package_versions
 from manicm_ms.realism import REALISM, RealismSample, parse_presets
 from manicm_ms.seeds import require_seed
@@ -300,7 +300,8 @@ def judge(
         console: where progress and table are printed.
     """
     with claimed_folder(out, request):
-        latencies = _latencies(contenders, protocol, out / "latency.json")
+        with working(console, "time the decisions"):
+            latencies = _latencies(contenders, protocol, out / "latency.json")
         by_preset, spec = _play(contenders, protocol, envs, out, console)
         episodes = by_preset[protocol.realism[0]]
         results = compile_results(contenders, protocol, episodes, latencies, command, envs.conditions)

@@ -11,6 +11,7 @@ from manicm_ms.errors import CheckpointError, ConfigError
 from manicm_ms.policies.checkpoint import load_checkpoint, read_manifest
 from manicm_ms.policies.diffusion import DiffusionPolicy
 from manicm_ms.policies.manicm import ManiCM
+from manicm_ms.progress import working
 from manicm_ms.seeds import require_seed
 from manicm_ms.training.features import encode_windows
 from manicm_ms.training.loop import Batches
@@ -83,7 +84,8 @@ def distill(
 
     def build() -> tuple[PolicyObjective, Batches]:
         network = policy.network.to(session.fabric.device)
-        with torch_threads(preset.threads):
+        seen = session.console if session.fabric.is_global_zero else None
+        with torch_threads(preset.threads), working(seen, "encode the demonstrations"):
             features = encode_windows(network, demos.windows.to(session.fabric.device), preset.draws, seed)
         return objective_type(policy, student, preset.mu), features
 
