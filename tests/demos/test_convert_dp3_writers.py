@@ -16,6 +16,7 @@ from dp3_stores import ACTION_DIM, DIM, FRAMES, LENGTHS, POINTS, contents, rows,
 
 from manicm_ms.cli import USER_ERROR, main
 from manicm_ms.demos.convert import import_store
+from manicm_ms.demos.convert.dp3 import Dp3Options, Reading
 from manicm_ms.demos.store import DemoStore
 from manicm_ms.demos.survey import survey
 from manicm_ms.errors import ConfigError, SpecMismatchError, StoreError
@@ -39,13 +40,19 @@ CODINGS = {
 }
 
 
-def read(source, out, **options):
-    """Import a store and return (notes, episodes' arrays, spec)."""
-    done = import_store(source, "dp3", out, **options)
-    with DemoStore.open(out) as store:
-        arrays = {name: store.frames(name) for name in store.fields}
-        assert store.lengths.tolist() == list(LENGTHS)
-        return " | ".join(done.notes), arrays, store.spec
+def read(source, **options):
+    """Read a store without writing ours; return (notes, arrays of all episodes, spec)."""
+    reading = Reading.of(source, Dp3Options(**options))
+    episodes = list(reading.episodes())
+    assert [len(e) for e in episodes] == list(LENGTHS)
+    names = ("point_cloud", "agent_pos", "action", *reading.pictures)
+    arrays = {name: np.concatenate([getattr(e, name) for e in episodes]) for name in names}
+    return " | ".join(reading.raw.notes), arrays, reading.spec
+
+
+def refuse(source, error, match, **options):
+    with pytest.raises(error, match=match):
+        Reading.of(source, Dp3Options(**options))
 
 
 @pytest.mark.filterwarnings("ignore:Consolidated metadata")
@@ -55,7 +62,7 @@ def test_every_coding_is_read_to_the_bit(tmp_path, coding):
     source = write_dp3(tmp_path / "a.zarr", given=given, **CODINGS[coding])
     with warnings.catch_warnings():
         warnings.simplefilter("error")
-        notes, arrays, _ = read(source, tmp_path / "ours.zarr", colors=True)
+        notes, arrays, _ = read(source, colors=True)
     np.testing.assert_array_equal(arrays["agent_pos"], given["data/state"], strict=True)
     np.testing.assert_array_equal(arrays["action"], given["data/action"], strict=True)
     for k in range(FRAMES):
@@ -72,10 +79,10 @@ def test_shards_are_read(tmp_path):
         "data/state", shape=state.shape, chunks=(1, DIM), shards=(4, DIM), dtype="f4", overwrite=True
     )
     array[:] = state
-    _, arrays, _ = read(source, tmp_path / "ours.zarr")
+    _, arrays, _ = read(source)
     np.testing.assert_array_equal(arrays["agent_pos"], state)
     (source / "data/state/c/1/0").unlink()
-    notes, arrays, _ = read(source, tmp_path / "lost.zarr")
+    notes, arrays, _ = read(source)
     assert "1 chunk file is missing: data/state/c/1/0" in notes
     assert not arrays["agent_pos"][4:8].any()
 
@@ -83,14 +90,14 @@ def test_shards_are_read(tmp_path):
 @pytest.mark.parametrize("dtype", ["f8", ">f4", "f2"])
 def test_other_floats_become_float32(tmp_path, dtype):
     given = contents(dtype=dtype)
-    _, arrays, _ = read(write_dp3(tmp_path / "a.zarr", given=given), tmp_path / "ours.zarr")
+    _, arrays, _ = read(write_dp3(tmp_path / "a.zarr", given=given))
     np.testing.assert_array_equal(arrays["agent_pos"], given["data/state"].astype("f4"))
     np.testing.assert_array_equal(arrays["action"], given["data/action"].astype("f4"))
 
 
 @pytest.mark.parametrize("ends", [np.cumsum(LENGTHS).astype(t) for t in ("f8", "u4", "i4", "f4")])
 def test_ends_of_any_number_type(tmp_path, ends):
-    read(write_dp3(tmp_path / "a.zarr", {"meta/episode_ends": ends}), tmp_path / "ours.zarr")
+    read(write_dp3(tmp_path / "a.zarr", {"meta/episode_ends": ends}))
 
 
 @pytest.mark.parametrize("zarr_format", [2, 3])
@@ -99,12 +106,11 @@ def test_idle_and_constant_channels_that_zarr_writes_no_file_for(tmp_path, zarr_
     given["data/state"][:, 1] = 0.25
     given["data/state"][:, 2] = 0.25 + 1e-7 * np.arange(FRAMES)
     source = write_dp3(tmp_path / "a.zarr", given=given, zarr_format=zarr_format)
-    notes, arrays, _ = read(source, tmp_path / "ours.zarr")
+    notes, arrays, _ = read(source)
     np.testing.assert_array_equal(arrays["action"], given["data/action"])
     np.testing.assert_array_equal(arrays["agent_pos"], given["data/state"])
     first = "data/action/0.0" if zarr_format == 2 else "data/action/c/0/0"
     assert f"3 chunk files are missing: {first}, " in notes
-    assert f"action never changes in {FRAMES} frames" in notes
 
 
 def pictures(dtype, low=0, high=256):
@@ -114,7 +120,7 @@ def pictures(dtype, low=0, high=256):
 def test_lost_pictures_are_counted_and_named(tmp_path):
     source = write_dp3(tmp_path / "a.zarr", {"data/img": pictures("u1")})
     (source / "data/img/1.0.0.0").unlink()
-    notes, arrays, _ = read(source, tmp_path / "ours.zarr")
+    notes, arrays, _ = read(source)
     assert "1 chunk file is missing: data/img/1.0.0.0" in notes
     assert not arrays["image"][5:10].any()
     (source / "data/point_cloud/0.0.0").unlink()
@@ -125,14 +131,14 @@ def test_lost_pictures_are_counted_and_named(tmp_path):
 @pytest.mark.parametrize("dtype", ["u2", "i8", "f4", "f8"])
 def test_pictures_of_whole_bytes_are_kept_whatever_their_type(tmp_path, dtype):
     given = pictures(dtype)
-    notes, arrays, _ = read(write_dp3(tmp_path / "a.zarr", {"data/img": given}), tmp_path / "ours.zarr")
+    notes, arrays, _ = read(write_dp3(tmp_path / "a.zarr", {"data/img": given}))
     np.testing.assert_array_equal(arrays["image"], given)
     assert f"data/img is {np.dtype(dtype).name} of whole numbers" in notes
 
 
 @pytest.mark.parametrize("given", [pictures("u2", 0, 301), pictures("f4") / np.float32(255), pictures("i4", -1, 3)])
 def test_other_pictures_are_left_out_and_not_wrapped(tmp_path, given):
-    notes, arrays, _ = read(write_dp3(tmp_path / "a.zarr", {"data/img": given}), tmp_path / "ours.zarr")
+    notes, arrays, _ = read(write_dp3(tmp_path / "a.zarr", {"data/img": given}))
     assert "image" not in arrays
     assert f"left out: data/img, {given.dtype} of {given.min():g} to {given.max():g}" in notes
 
@@ -166,7 +172,7 @@ BLENDED[BLENDED > 255] = 255
 def test_colours_are_decided_once_a_store(tmp_path, rgb, divisor, said):
     clouds = colored(rgb)
     source = write_dp3(tmp_path / "a.zarr", {"data/point_cloud": clouds})
-    notes, arrays, _ = read(source, tmp_path / "ours.zarr", colors=True)
+    notes, arrays, _ = read(source, colors=True)
     expected = np.concatenate([clouds[..., :3], (rgb / divisor).clip(0, 1)], axis=-1).astype("f4")
     for k in range(FRAMES):
         np.testing.assert_array_equal(rows(arrays["point_cloud"][k]), rows(expected[k]))
@@ -178,7 +184,7 @@ def test_colours_of_another_range_are_refused(tmp_path, rgb):
     source = write_dp3(tmp_path / "a.zarr", {"data/point_cloud": colored(rgb)})
     with pytest.raises(SpecMismatchError, match="where 0 to 1 and 0 to 255 can be read: leave out --colors"):
         import_store(source, "dp3", tmp_path / "ours.zarr", colors=True)
-    notes, arrays, _ = read(source, tmp_path / "ours.zarr")
+    notes, arrays, _ = read(source)
     assert arrays["point_cloud"].shape[-1] == 3
     assert "left out: rgb of the points; --colors keeps it" in notes
 
@@ -188,33 +194,23 @@ def test_clouds_in_millimetres(tmp_path):
     source = write_dp3(tmp_path / "a.zarr", {"data/point_cloud": given * np.float32(1000)})
     with pytest.raises(SpecMismatchError, match=r"reaches [\d.]+ m, 100 % .* likely millimetres.*--cloud-scale 0.001"):
         import_store(source, "dp3", tmp_path / "no.zarr")
-    _, arrays, _ = read(source, tmp_path / "ours.zarr", cloud_scale=0.001)
+    _, arrays, _ = read(source, cloud_scale=0.001)
     np.testing.assert_allclose(rows(arrays["point_cloud"][0]), rows(given[0]), rtol=1e-6)
-    notes, arrays, _ = read(source, tmp_path / "meant.zarr", cloud_scale=1.0)
+    _, arrays, _ = read(source, cloud_scale=1.0)
     np.testing.assert_array_equal(rows(arrays["point_cloud"][0]), rows(given[0] * np.float32(1000)))
-    assert "beyond 10 m: likely millimetres" in notes
-
-
-def test_a_stray_point_is_said_and_kept(tmp_path):
-    clouds = np.random.default_rng(0).uniform(0.1, 0.4, (FRAMES, 40, 3)).astype("f4")
-    clouds[2, 3, 2] = 65.535
-    notes, arrays, _ = read(write_dp3(tmp_path / "a.zarr", {"data/point_cloud": clouds}), tmp_path / "ours.zarr")
-    assert arrays["point_cloud"].max() == np.float32(65.535)
-    assert "point_cloud reaches 65.54 m, 0.208 % of it beyond 10 m: likely stray readings" in notes
 
 
 def test_depth_in_a_cameras_units(tmp_path):
     raw = np.random.default_rng(0).integers(2000, 4000, (FRAMES, 4, 5))
     for dtype, said in (("f8", r"reaches 3\d\d\d m, 100 % of it beyond 20 m"), ("u2", "uint16, a camera's units")):
         source = write_dp3(tmp_path / f"{dtype}.zarr", {"data/depth": raw.astype(dtype)})
-        notes, arrays, _ = read(source, tmp_path / f"without-{dtype}.zarr")
+        notes, arrays, _ = read(source)
         assert "depth" not in arrays
         assert re.search(f"left out: data/depth, .*{said}.*--depth-scale", notes), notes
-        notes, arrays, spec = read(source, tmp_path / f"with-{dtype}.zarr", depth_scale=0.00025)
+        notes, arrays, spec = read(source, depth_scale=0.00025)
         np.testing.assert_array_equal(arrays["depth"], (raw * 0.00025).astype("f4"))
         assert spec.obs.image_size == (4, 5)
-    with pytest.raises(ConfigError, match="holds no depth that can be kept: drop --depth-scale"):
-        import_store(write_dp3(tmp_path / "none.zarr"), "dp3", tmp_path / "no.zarr", depth_scale=0.001)
+    refuse(write_dp3(tmp_path / "none.zarr"), ConfigError, "holds no depth that can be kept", depth_scale=0.001)
 
 
 def test_actions_in_radians(tmp_path):
@@ -228,13 +224,11 @@ def test_actions_in_radians(tmp_path):
     for wrong, match in (((2.81, 3.0), "has 2 numbers where actions have 3"), ((-1.0,), "must be positive")):
         with pytest.raises(ConfigError, match=match):
             import_store(source, "dp3", tmp_path / "no.zarr", action_scale=wrong)
-    notes, arrays, _ = read(source, tmp_path / "one.zarr", action_scale=(2.81,))
+    notes, arrays, _ = read(source, action_scale=(2.81,))
     np.testing.assert_array_equal(arrays["action"], (joints.astype("f8") / 2.81).astype("f4"))
     assert "actions are divided by 2.81" in notes
-    _, arrays, _ = read(source, tmp_path / "three.zarr", action_scale=(2.81, 3.0, 4.0))
+    _, arrays, _ = read(source, action_scale=(2.81, 3.0, 4.0))
     np.testing.assert_array_equal(arrays["action"], (joints / np.array([2.81, 3, 4])).astype("f4"))
-    with DemoStore.open(tmp_path / "three.zarr") as store:
-        assert store.provenance["scales"]["action"] == [2.81, 3.0, 4.0]
 
 
 def test_all_that_is_left_out_is_named(tmp_path):
@@ -243,7 +237,7 @@ def test_all_that_is_left_out_is_named(tmp_path):
         "data/point_cloud": clouds, "data/full_state": np.zeros((FRAMES, 33)), "data/stage": np.zeros(FRAMES, "i8"),
         "meta/task": np.zeros(3, "u1"), "data/img": np.zeros((FRAMES, 3, 4, 5), "u1"),
     }  # fmt: skip
-    notes, _, _ = read(write_dp3(tmp_path / "a.zarr", changes), tmp_path / "ours.zarr")
+    notes, _, _ = read(write_dp3(tmp_path / "a.zarr", changes))
     for said in (
         "data/full_state (12, 33) <f8, data/stage (12,) <i8, meta/task (3,) |u1",
         "left out: data/img, which is (12, 3, 4, 5) uint8 where (F, H, W, 3) numbers are read",
@@ -257,6 +251,60 @@ def test_a_single_episode_of_one_frame(tmp_path):
     given = {name: values[:1] for name, values in contents().items()} | {"meta/episode_ends": np.array([1])}
     done = import_store(write_dp3(tmp_path / "a.zarr", given=given), "dp3", tmp_path / "ours.zarr")
     assert (done.episodes, done.frames) == (1, 1)
+
+
+def test_what_is_read_is_what_our_store_holds(tmp_path, capsys):
+    clouds = np.random.default_rng(0).uniform(0.1, 0.4, (FRAMES, 40, 3)).astype("f4")
+    clouds[2, 3, 2] = 65.535
+    changes = {
+        "data/point_cloud": clouds, "data/action": np.full((FRAMES, ACTION_DIM), 1.5, "f8"),
+        "data/img": pictures("f4"), "data/depth": np.full((FRAMES, 4, 5), 700, "u2"),
+    }  # fmt: skip
+    source, out = write_dp3(tmp_path / "a.zarr", changes), tmp_path / "ours.zarr"
+    options = ["--action-scale", "2", "3", "4", "--depth-scale", "0.001", "--control-hz", "20"]
+    with pytest.raises(SystemExit, match=r"^0$"):
+        main(["convert", str(source), "--from", "dp3", "--out", str(out), *options])
+    said = " ".join(capsys.readouterr().out.split())
+    assert "3 episodes, 12 frames" in said
+    assert "action never changes in 12 frames: an idle robot, or lost data" in said
+    assert "point_cloud reaches 65.54 m, 0.208 % of it beyond 10 m: likely stray readings of a camera" in said
+    _, arrays, spec = read(source, action_scale=(2.0, 3.0, 4.0), depth_scale=0.001, control_hz=20.0)
+    with DemoStore.open(out) as store:
+        assert store.spec == spec
+        assert store.provenance["scales"] == {"cloud": None, "depth": 0.001, "action": [2.0, 3.0, 4.0]}
+        assert set(store.fields) == set(arrays)
+        for name, values in arrays.items():
+            np.testing.assert_array_equal(store.frames(name), values, strict=True)
+
+
+@pytest.mark.parametrize("ends", [[3.5, 12], [[3], [12]], [3, 3, 12], [np.nan, 12]])
+def test_ends_that_are_none_are_blamed_themselves(tmp_path, ends):
+    source = write_dp3(tmp_path / "a.zarr", {"meta/episode_ends": np.array(ends)})
+    refuse(source, StoreError, "meta/episode_ends (is .* where whole numbers on one axis belong|does not grow)")
+
+
+def test_a_store_as_zarr_2_itself_writes_it(tmp_path):
+    """By the specification of format 2, without zarr: a null fill value, no attributes, a padded last chunk."""
+    given = contents()
+    codec = numcodecs.Blosc("zstd", clevel=3, shuffle=1)
+    for name, values in given.items():
+        folder = tmp_path / "a.zarr" / name
+        folder.mkdir(parents=True)
+        header = {
+            "zarr_format": 2, "shape": list(values.shape), "chunks": [7, *values.shape[1:]], "order": "C",
+            "dtype": values.dtype.str, "compressor": codec.get_config(), "fill_value": None, "filters": None,
+        }  # fmt: skip
+        (folder / ".zarray").write_text(json.dumps(header))
+        for start in range(0, len(values), 7):
+            chunk = np.zeros((7, *values.shape[1:]), values.dtype)
+            chunk[: len(values[start : start + 7])] = values[start : start + 7]
+            key = ".".join([str(start // 7)] + ["0"] * (values.ndim - 1))
+            (folder / key).write_bytes(codec.encode(chunk))
+    (tmp_path / "a.zarr/.zgroup").write_text('{"zarr_format": 2}')
+    notes, arrays, _ = read(tmp_path / "a.zarr")
+    np.testing.assert_array_equal(arrays["agent_pos"], given["data/state"], strict=True)
+    np.testing.assert_array_equal(arrays["action"], given["data/action"], strict=True)
+    assert notes == ""
 
 
 def test_values_that_are_not_finite_are_placed(tmp_path):

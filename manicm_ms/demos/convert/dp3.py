@@ -6,6 +6,7 @@ can be checked is checked; what cannot (frames, units, the meaning of entries) i
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -74,25 +75,71 @@ def read_dp3(source: Path, folder: Path, **options: Any) -> Tally:
     environment; ConfigError, UnknownNameError, NoSpaceError.
     """
     asked = Dp3Options(**options)
-    raw = RawStore.open(source)
-    spec = _spec(raw, asked)
-    scales = decide(
-        raw, colors=asked.colors, cloud_scale=asked.cloud_scale, depth_scale=asked.depth_scale,
-        action_scale=asked.action_scale,
-    )  # fmt: skip
-    spec = _with_pictures(spec, raw)
-    pictures = [name for name in OPTIONAL if name in raw.arrays]
+    reading = Reading.of(source, asked)
+    raw, spec = reading.raw, reading.spec
     frame_bytes = 4 * (spec.obs.num_points * spec.obs.point_channels + spec.obs.agent_pos_dim + spec.action.dim)
     require_free_space(folder, frame_bytes * raw.num_frames)
     tally = Tally(notes=["seeds and success are not known: seeds count down from -1, all count as solved", *raw.notes])
-    with DemoStore.create(folder, spec, _provenance(raw, asked, spec), extras=pictures) as store:
-        for number, (start, stop) in enumerate(raw.episodes()):
-            episode = _episode(raw, spec, scales, number, start, stop, pictures)
+    with DemoStore.create(folder, spec, _provenance(raw, asked, spec), extras=reading.pictures) as store:
+        for episode in reading.episodes():
             store.append(episode)
             tally.add(episode)
         store.note(attempts=tally.episodes)
         tally.notes += [*store_remarks(store), *(_frame_remarks(store, asked.env) if asked.env else [])]
     return tally
+
+
+@dataclass(frozen=True)
+class Reading:
+    """A store of DP3's layout and all that is decided about how it is read.
+
+    Attributes:
+        raw: the store; its notes say what was decided.
+        spec: of the store to be made.
+        scales: of its numbers.
+    """
+
+    raw: RawStore
+    spec: EnvSpec
+    scales: Scales
+
+    @classmethod
+    def of(cls, source: Path, asked: Dp3Options) -> Reading:
+        """Open the store at `source` and decide; raises as `read_dp3`."""
+        raw = RawStore.open(source)
+        spec = _spec(raw, asked)
+        scales = decide(
+            raw, colors=asked.colors, cloud_scale=asked.cloud_scale, depth_scale=asked.depth_scale,
+            action_scale=asked.action_scale,
+        )  # fmt: skip
+        return cls(raw, _with_pictures(spec, raw), scales)
+
+    @property
+    def pictures(self) -> tuple[str, ...]:
+        """The optional fields of `Episode` that are kept."""
+        return tuple(name for name in OPTIONAL if name in self.raw.arrays)
+
+    def episodes(self) -> Iterator[Episode]:
+        """Yield the episodes in their order, with a progress bar; raise StoreError where one cannot be decoded."""
+        for number, (start, stop) in enumerate(self.raw.episodes()):
+            yield self._episode(number, start, stop)
+
+    def _episode(self, number: int, start: int, stop: int) -> Episode:
+        raw, obs = self.raw, self.spec.obs
+        extras: dict[str, Any] = {name: raw.read(name, start, stop) for name in self.pictures}
+        if "image" in extras:
+            extras["image"] = extras["image"].astype(np.uint8)  # whole numbers from 0 to 255, of whatever type
+        if "depth" in extras:
+            extras["depth"] = self.scales.depth(extras["depth"])
+        clouds = self.scales.cloud(raw.read("point_cloud", start, stop), obs.point_channels)
+        return Episode(
+            point_cloud=np.stack([_resampled(cloud, obs.num_points) for cloud in clouds]),
+            agent_pos=raw.read("agent_pos", start, stop).astype(np.float32),
+            action=self.scales.actions(raw.read("action", start, stop)),
+            seed=-1 - number,
+            success=True,
+            **extras,
+        )
 
 
 def _spec(raw: RawStore, asked: Dp3Options) -> EnvSpec:
@@ -142,23 +189,6 @@ def _spec_of_shapes(raw: RawStore, asked: Dp3Options) -> EnvSpec:
         action=ActionSpec(tuple(f"action_{k}" for k in range(action_dim)), "unknown", asked.control_hz or _CONTROL_HZ),
         max_episode_steps=int(np.diff(raw.ends, prepend=0).max()),
         agent_pos_names=tuple(f"state_{k}" for k in range(dim)),
-    )
-
-
-def _episode(
-    raw: RawStore, spec: EnvSpec, scales: Scales, number: int, start: int, stop: int, pictures: list[str]
-) -> Episode:
-    extras: dict[str, Any] = {name: raw.read(name, start, stop) for name in pictures}
-    if "depth" in extras:
-        extras["depth"] = scales.depth(extras["depth"])
-    clouds = scales.cloud(raw.read("point_cloud", start, stop), spec.obs.point_channels)
-    return Episode(
-        point_cloud=np.stack([_resampled(cloud, spec.obs.num_points) for cloud in clouds]),
-        agent_pos=raw.read("agent_pos", start, stop).astype(np.float32),
-        action=scales.actions(raw.read("action", start, stop)),
-        seed=-1 - number,
-        success=True,
-        **extras,
     )
 
 
