@@ -1,5 +1,6 @@
-"""Finds the toy tasks' folder, and runs the command as a user does."""
+"""Finds the toy tasks' folder, and runs the command as a user does: in a process of its own, or in this one."""
 
+import importlib
 import os
 import signal
 import subprocess
@@ -7,6 +8,9 @@ import sys
 from pathlib import Path
 
 import pytest
+
+from manicm_ms import tasks
+from manicm_ms.cli import main
 
 TOY_TASKS = Path(__file__).parent / "toy_tasks"
 OPTIONS = ("--preset", "smoke", "--demos", "3", "--episodes", "4", "--num-envs", "1")
@@ -32,3 +36,19 @@ def start_benchmark(benchmark_environment):
         )  # fmt: skip
 
     return start
+
+
+@pytest.fixture
+def benchmark_here(monkeypatch, capsys):
+    """Run the same command in this process, which saves the start of one; return its exit status and output."""
+    monkeypatch.setenv("MANICM_MS_TASKS", str(TOY_TASKS))  # for the processes that do the jobs
+    if str(TOY_TASKS) not in tasks.__path__:  # what the variable does where `tasks` is imported after it was set
+        tasks.__path__.append(str(TOY_TASKS))
+    importlib.import_module("manicm_ms.tasks.bench_points")
+
+    def run(out, *words):
+        with pytest.raises(SystemExit) as end:
+            main(["benchmark", *OPTIONS, "--out", str(out), *map(str, words)])
+        return end.value.code, "".join(capsys.readouterr())
+
+    return run

@@ -35,19 +35,19 @@ def address(benchmark_environment):
 def test_two_nodes_work_the_grid_off(address, tmp_path, start_benchmark):
     assert address, "no cluster came up"
     out = tmp_path / "ray"
-    grid = ("--envs", "toy/near,toy/far", "--methods", "simple_dp3,manicm", "--seeds", "0", "--ray", address)
+    grid = ("--envs", "toy/near,toy/far", "--methods", "simple_dp3", "--seeds", "0", "--ray", address)
     process = start_benchmark(out, *grid)
-    output, _ = process.communicate(timeout=240)
+    output, _ = process.communicate(timeout=600)
     assert process.returncode == 0, output
     found = json.loads((out / "results.json").read_text())
-    assert [c["n"] for c in found["cells"]] == [4] * 4
+    assert [c["n"] for c in found["cells"]] == [4] * 2
     assert not found["missing"]
     places = {json.loads(path.read_text())["place"] for path in out.rglob("*.json") if path.name == "train.json"}
     assert len(places) == 2, "both nodes had a part in it"
 
 
-def test_no_cluster_at_an_address_is_one_line(tmp_path, start_benchmark):
-    process = start_benchmark(tmp_path / "none", "--envs", "toy/near", "--seeds", "0", "--ray", "127.0.0.1:1")
-    output, _ = process.communicate(timeout=120)
-    assert process.returncode == 2, output
+def test_no_cluster_at_an_address_is_one_line(tmp_path, benchmark_here):
+    words = ("--envs", "toy/near", "--seeds", "0", "--ray", "127.0.0.1:1")
+    code, output = benchmark_here(tmp_path / "none", *words)
+    assert code == 2, output
     assert "no Ray cluster answers at '127.0.0.1:1'" in " ".join(output.split())

@@ -8,7 +8,11 @@ import pytest
 
 from manicm_ms import vulkan
 
-MAKE = """
+# One process for both: it takes longest to begin.
+SCRIPT = """
+import sys
+
+from manicm_ms.cli import main
 from manicm_ms.envs.vec_env import make_vec
 from manicm_ms.errors import RenderDeviceError
 
@@ -17,23 +21,29 @@ if __name__ == "__main__":
     try:
         env.reset(seed=[0])
     except RenderDeviceError as error:
-        print(error)
+        print(error, flush=True)
     finally:
         env.close()
+    print("now the command", flush=True)
+    main(["collect", "ur3e/slide-block", "--episodes", "1", "--backend", "cpu", "--out", sys.argv[1]])
 """
 
 
-def without_vulkan(tmp_path, *words):
-    """Run Python where the Vulkan loader finds no driver."""
-    drivers = dict.fromkeys(("VK_DRIVER_FILES", "VK_ICD_FILENAMES"), str(tmp_path / "missing.json"))
-    env = os.environ | drivers | {"MANICM_MS_VULKAN": "system", "OMP_NUM_THREADS": "1"}
-    return subprocess.run([sys.executable, *map(str, words)], env=env, capture_output=True, text=True, check=False)
+@pytest.fixture(scope="module")
+def ended(tmp_path_factory):
+    """The script's folder and end where the Vulkan loader finds no driver: the library's error, then the command's."""
+    folder = tmp_path_factory.mktemp("no_vulkan")
+    (folder / "script.py").write_text(SCRIPT)
+    drivers = dict.fromkeys(("VK_DRIVER_FILES", "VK_ICD_FILENAMES"), str(folder / "missing.json"))
+    env = os.environ | drivers | {"MANICM_MS_VULKAN": "system"}
+    words = [sys.executable, folder / "script.py", folder / "demos.zarr"]
+    return folder, subprocess.run(words, env=env, capture_output=True, text=True, check=False)
 
 
-def require_the_remedy(line, tmp_path):
+def require_the_remedy(line, folder):
     assert "no Vulkan device" in line
     for variable in ("VK_DRIVER_FILES", "VK_ICD_FILENAMES"):
-        assert f"{variable}={tmp_path / 'missing.json'}" in line
+        assert f"{variable}={folder / 'missing.json'}" in line
     assert "missing.json does not exist; unset it" in line
 
 
@@ -60,20 +70,17 @@ def test_the_driver_that_set_up_chose_is_nobodys_mistake(monkeypatch, tmp_path):
     assert "make setup" in str(vulkan.no_device())
 
 
-def test_reset_raises_a_render_device_error(tmp_path):
-    script = tmp_path / "make.py"
-    script.write_text(MAKE)
-    done = without_vulkan(tmp_path, script)
-    assert done.returncode == 0, done.stderr
-    (line,) = done.stdout.strip().splitlines()
-    require_the_remedy(line, tmp_path)
+def test_reset_raises_a_render_device_error(ended):
+    folder, done = ended
+    said, marker, _ = done.stdout.partition("now the command\n")
+    assert marker, done.stderr
+    (line,) = said.strip().splitlines()
+    require_the_remedy(line, folder)
 
 
-def test_collect_ends_with_status_2_and_one_line(tmp_path):
-    out = tmp_path / "demos.zarr"
-    collect = ("collect", "ur3e/slide-block", "--episodes", 1, "--backend", "cpu", "--out", out)
-    done = without_vulkan(tmp_path, "-m", "manicm_ms.cli", *collect)
+def test_collect_ends_with_status_2_and_one_line(ended):
+    folder, done = ended
     assert done.returncode == 2, done.stderr
     assert "Traceback" not in done.stdout + done.stderr
     (line,) = [line for line in done.stderr.splitlines() if "Vulkan" in line and "SAPIEN" in line]
-    require_the_remedy(line, tmp_path)
+    require_the_remedy(line, folder)
