@@ -146,6 +146,7 @@ def test_two_commands_share_the_work_and_go_on_after_both_are_stopped(whole, tmp
         assert time.monotonic() < until, "workers of a run that was stopped must not live on"
         time.sleep(0.1)
     assert not (out / "results.json").exists()
+    assert [path.read_text() for path in out.rglob("*.failed.json")] == [], "to be stopped is no failure"
     claims, done = begun(out, pair), finished(out)
     assert len(claims) == len(set(claims)), "every job was begun by one of them alone"
     assert done <= set(claims)
