@@ -27,7 +27,7 @@ from manicm_ms.envs.chunk import ActionChunk
 from manicm_ms.envs.maniskill import ManiSkillSimulator
 from manicm_ms.envs.simulator import ENVS, SimulatorConfig
 from manicm_ms.errors import ConfigError, ManicmError
-from manicm_ms.evaluation.statistics import wilson_interval
+from manicm_ms.evaluation.intervals import rate_interval
 from manicm_ms.robots.ur3e_ag95 import ARM_JOINTS, JOINT_EFFORT, JOINT_SPEED
 from manicm_ms.types import STATE
 
@@ -241,7 +241,7 @@ def joint_table(results: Results, attribute: str, limits: tuple[float, ...], for
 
 def _success(episodes: list[EpisodeMotion]) -> str:
     k, n = sum(e.success for e in episodes), len(episodes)
-    low, high = wilson_interval(k, n)
+    low, high = rate_interval(k, n)
     return f"{k}/{n}, 95 % CI {low:.1%} to {high:.1%}"
 
 
@@ -290,7 +290,7 @@ def _page(episodes: int, results: Results) -> str:
 Seeds 0 to {episodes - 1}, one row on the CPU backend. Mean over the episodes, largest episode in brackets.
 Accelerations are differences of states one control step (50 ms) apart; the command is the controller's TCP target,
 which the arm follows about 0.1 s later. Forces are taken at the end of each control step. An episode ends with its
-success.
+success. Intervals are Clopper-Pearson's.
 
 {summary_table(results)}
 

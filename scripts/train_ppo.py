@@ -36,7 +36,7 @@ from manicm_ms.devices import torch_threads
 from manicm_ms.envs.sb3 import AbsorbingSuccess, StableBaselinesEnv, normalized_return
 from manicm_ms.envs.vec_env import VecEnv, make_vec
 from manicm_ms.errors import ConfigError, ManicmError
-from manicm_ms.evaluation.statistics import wilson_interval
+from manicm_ms.evaluation.intervals import rate_interval
 from manicm_ms.paths import write_json
 from manicm_ms.provenance import package_versions
 from manicm_ms.training.interrupt import StopRequest, stop_requests
@@ -368,7 +368,8 @@ def report(args: Report) -> None:
         for name in (SETTINGS, CURVE, SCORES)
     )
     labels = [f"PPO, seed {s['seed']}" for s in settings]
-    print("| player | mean normalised return | success | 95 % interval | control steps played |\n|---|---|---|---|---|")
+    print("| player | mean normalised return | success | 95 % interval (Clopper-Pearson) | control steps played |")
+    print("|---|---|---|---|---|")
     for label, curve, score in zip(labels, curves, scores, strict=True):
         print(_row(f"{label}, after {curve[-1]['steps']} control steps", score["PPO"]))
     for name in REFERENCES:
@@ -377,7 +378,7 @@ def report(args: Report) -> None:
 
 
 def _row(name: str, score: dict[str, Any]) -> str:
-    low, high = (100 * bound for bound in wilson_interval(score["successes"], score["episodes"]))
+    low, high = (100 * bound for bound in rate_interval(score["successes"], score["episodes"]))
     success = f"{score['successes']}/{score['episodes']} | {low:.1f} to {high:.1f} %"
     return f"| {name} | {score['mean_return']:.3f} | {success} | {score['mean_steps']:.0f} |"
 

@@ -9,6 +9,7 @@ from typing import Any, NamedTuple
 from rich.table import Table
 
 from manicm_ms.evaluation.report import format_ms, template
+from manicm_ms.evaluation.resampling import MANY_TRAININGS, RECIPE
 from manicm_ms.paths import write_json, write_text
 
 _PAPER_COLUMNS = ("adroit", "easy", "medium", "hard", "very-hard", "average", "ms")
@@ -37,12 +38,26 @@ def main_table(results: Mapping[str, Any]) -> TextTable:
     """Return success by group and average on fresh seeds, with the 95 % interval, NFE and time of a decision."""
 
     def shown(entry: Mapping[str, Any]) -> str:
-        spread = "" if entry["sd_over_seeds"] is None else f", sd {100 * entry['sd_over_seeds']:.1f}"
-        return f"{_percent(entry['success_rate'])} ({_interval(entry['ci95'])}{spread})"
+        return f"{_percent(entry['success_rate'])} ({_interval(entry['ci95'])})"
 
-    return _by_group(
-        results, "Success on fresh seeds, % (95 % interval of the episodes, sd over training seeds)", shown
-    )
+    return _by_group(results, "Success on fresh seeds, % (95 % interval)", shown)
+
+
+def training_table(results: Mapping[str, Any]) -> TextTable | None:
+    """Return the average over tasks of each training, their mean and range, or None where there is one training."""
+    rows = [(row, row["average"]) for row in results["rows"] if row["average"] is not None]
+    seeds = list(dict.fromkeys(seed for _, entry in rows for seed in entry["by_seed"]))
+    if len(seeds) < 2:
+        return None
+    lines = []
+    for row, entry in rows:
+        each = [_percent(entry["by_seed"][s]) if s in entry["by_seed"] else "-" for s in seeds]
+        low, high = entry["range"]
+        interval = f"{_interval(entry['ci95'], 1)} ({entry['speaks_of']})"
+        spread = f"{_percent(low)} to {_percent(high)}"
+        lines.append((row["method"], *each, _percent(entry["success_rate"]), spread, interval))
+    headers = ("method", *(f"training {seed}" for seed in seeds), "mean", "range", "95 % interval of the mean")
+    return TextTable("Average over all tasks by training, %", headers, lines)
 
 
 def highest_table(results: Mapping[str, Any]) -> TextTable | None:
@@ -110,45 +125,101 @@ def _counted(cell: Mapping[str, Any]) -> str:
         return "-"
     crashed = f", {cell['crashed']} crashed" if cell["crashed"] else ""
     seeds = ", ".join(f"{100 * rate:.0f}" for rate in cell["by_seed"].values())
-    by_seed = f"; seeds {seeds} %" if len(cell["by_seed"]) > 1 else ""
+    by_seed = f"; trainings {seeds} %" if len(cell["by_seed"]) > 1 else ""
     return f"{cell['successes']}/{cell['n']} ({_interval(cell['ci95'])}{by_seed}{crashed})"
 
 
+def end_table(results: Mapping[str, Any]) -> TextTable | None:
+    """Return success at some step and at the last one, or None where neither is known of any task."""
+    cells = {(c["env_id"], c["method"]): c for c in results["cells"]}
+    kinds = ("success_once", "success_at_end")
+    if not any(cell.get(kind) for cell in cells.values() for kind in kinds):
+        return None
+    methods = [row["method"] for row in results["rows"]]
+
+    def told(cell: Mapping[str, Any]) -> str:
+        return ", ".join("-" if not cell.get(k) else f"{_won(cell[k])}/{cell['n']}" for k in kinds)
+
+    lines = [(e, *(told(cells[e, m]) if cells[e, m]["n"] else "-" for m in methods)) for e in results["env_ids"]]
+    return TextTable("Success at some step, at the last step of the episode", ("task", *methods), lines)
+
+
+def _won(outcomes: Mapping[str, Sequence[bool]]) -> int:
+    return sum(sum(episodes) for episodes in outcomes.values())
+
+
+def paired_table(pair: Mapping[str, Any]) -> TextTable:
+    """Return one comparison task by task, McNemar's exact test for each training on its own."""
+    lines = []
+    for entry in pair["by_task"]:
+        low, high = (100 * bound for bound in entry["ci95"])
+        difference = f"{100 * entry['difference']:+.1f} ({low:+.1f} to {high:+.1f})"
+        counts = (str(entry[name]) for name in ("both", "only_first", "only_second", "neither"))
+        p_values = ", ".join(f"{p:.2g}" for p in entry["mcnemar_p"].values())
+        lines.append((entry["env_id"], difference, *counts, p_values))
+    first, second = pair["first"], pair["second"]
+    headers = ("task", "points (95 % interval)", "both", f"only {first}", f"only {second}", "neither", "McNemar's p")
+    return TextTable(f"{second} minus {first} by task", headers, lines)
+
+
 def paired_lines(results: Mapping[str, Any]) -> list[str]:
-    """Return what the paired comparisons say, in words."""
+    """Return what the paired comparisons say, in words; no p value pools tasks or trainings."""
     lines = []
     for pair in results["paired"]:
-        low, high = pair["difference_ci95"]
-        n = pair["both"] + pair["only_first"] + pair["only_second"] + pair["neither"]
-        seeds = ", ".join(f"{100 * d:+.1f}" for d in pair["difference_by_seed"].values())
+        tests = (
+            f"McNemar's exact test, each task and training on its own: the smallest p of {pair['tests']} is "
+            f"{pair['smallest_p']:.2g}, {pair['smallest_p_holm']:.2g} after Holm's correction."
+        )
+        if pair["difference"] is None:
+            lines.append(f"{pair['second']} minus {pair['first']}: no training is done on all tasks yet. {tests}")
+            continue
+        low, high = (100 * bound for bound in pair["ci95"])
+        each = ", ".join(f"{100 * d:+.1f}" for d in pair["by_seed"].values())
+        by_training = f"by training {each}; " if len(pair["by_seed"]) > 1 else ""
         lines.append(
-            f"{pair['second']} minus {pair['first']}, these trainings paired on the same {n} episodes of "
-            f"{pair['tasks']} tasks: {100 * pair['difference']:+.1f} points (by training seed {seeds}; 95 % interval "
-            f"{100 * low:+.1f} to {100 * high:+.1f}; McNemar's exact test p = {pair['mcnemar_p']:.2g}; both "
-            f"{pair['both']}, only {pair['first']} {pair['only_first']}, only {pair['second']} {pair['only_second']}, "
-            f"neither {pair['neither']})."
+            f"{pair['second']} minus {pair['first']}, mean of {pair['tasks']} tasks on the same {pair['start_states']} "
+            f"start states: {100 * pair['difference']:+.1f} points ({by_training}95 % interval {low:+.1f} to "
+            f"{high:+.1f}, of {pair['speaks_of']}). {tests}"
         )
     return lines
 
 
+def interval_lines(results: Mapping[str, Any]) -> list[str]:
+    """Return how the intervals were made and what they speak of."""
+    methods = results["intervals"]
+    recipe = any(row["average"] and row["average"]["speaks_of"] == RECIPE for row in results["rows"])
+    scope = (
+        f"From {MANY_TRAININGS} trainings on these are drawn again too, and the interval speaks of the recipe"
+        if recipe
+        else "They speak of these networks, not of what another training would give"
+    )
+    return [
+        f"95 % intervals of rates: {methods['rate']}. Of differences: {methods['difference']}. {scope}; nor do they "
+        "hold the choice of tasks."
+    ]
+
+
 def write_benchmark(results: Mapping[str, Any], out: Path) -> None:
     """Write results.json, report.md and report.html into `out`."""
-    context = {
-        "results": results,
-        "tables": [t for t in (main_table(results), highest_table(results), paper_table(results)) if t is not None]
-        + [task_table(results)],
-        "sentences": paired_lines(results),
-    }
+    context = {"results": results, "tables": all_tables(results), "sentences": paired_lines(results)}
+    context["notes"] = interval_lines(results)
     write_json(out / "results.json", results)
     package = "manicm_ms.benchmark"
     write_text(out / "report.md", template("benchmark.md.j2", autoescape=False, package=package).render(context))
     write_text(out / "report.html", template("benchmark.html.j2", autoescape=True, package=package).render(context))
 
 
+def all_tables(results: Mapping[str, Any]) -> list[TextTable]:
+    """Return every table of a report."""
+    main = [main_table(results), training_table(results), highest_table(results), paper_table(results)]
+    by_task = [task_table(results), end_table(results), *(paired_table(pair) for pair in results["paired"])]
+    return [table for table in (*main, *by_task) if table is not None]
+
+
 def rich_tables(results: Mapping[str, Any]) -> list[Table]:
     """Return the main tables for a terminal."""
     found = []
-    for text in (main_table(results), highest_table(results), task_table(results)):
+    for text in (main_table(results), training_table(results), highest_table(results), task_table(results)):
         if text is None:
             continue
         table = Table(*text.headers, title=text.title)
@@ -162,5 +233,5 @@ def _percent(rate: float) -> str:
     return f"{100 * rate:.1f}"
 
 
-def _interval(ci95: Sequence[float]) -> str:
-    return f"{100 * ci95[0]:.0f} to {100 * ci95[1]:.0f}"
+def _interval(ci95: Sequence[float], digits: int = 0) -> str:
+    return f"{100 * ci95[0]:.{digits}f} to {100 * ci95[1]:.{digits}f}"

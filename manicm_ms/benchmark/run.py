@@ -11,7 +11,7 @@ from rich.console import Console
 from manicm_ms.benchmark.jobs import Job, all_jobs
 from manicm_ms.benchmark.plan import Plan
 from manicm_ms.benchmark.pool import run_in_processes
-from manicm_ms.benchmark.report import paired_lines, rich_tables, write_benchmark
+from manicm_ms.benchmark.report import interval_lines, paired_lines, rich_tables, write_benchmark
 from manicm_ms.benchmark.table import compile_table, measure_decisions
 from manicm_ms.demos.experts import EXPERTS
 from manicm_ms.envs.simulator import ENVS, SimulatorConfig
@@ -94,7 +94,7 @@ def _claim(plan: Plan) -> None:
 def _show(results: dict[str, Any], out: Path, console: Console) -> None:
     for table in rich_tables(results):
         console.print(table)
-    for sentence in paired_lines(results):
+    for sentence in (*paired_lines(results), *interval_lines(results)):
         console.print(sentence, highlight=False, markup=False)
     for entry in results["missing"]:
         console.print(f"missing: {entry['job']}: {entry['reason']}", style="red", highlight=False, markup=False)

@@ -218,7 +218,9 @@ def evaluate_command(
     realism: str = "clean",
     camera: Path | None = None,
     obs_preset: str = "manicm_ms",
-) -> None:
+    allow_seen_seeds: bool = False,
+    to_the_end: bool = True,
+) -> int:
     """Judge checkpoints on the same fresh seeds: success with intervals, paired difference, decision latency, report.
 
     Args:
@@ -236,14 +238,19 @@ def evaluate_command(
         realism: presets separated by commas, as in clean,d435i,d435i+dr: every policy plays the same seeds under each.
         camera: YAML file of the cell's depth camera, as 'manicm-ms calibrate' writes it.
         obs_preset: the one that the policies were trained with: manicm_ms or dp3.
+        allow_seen_seeds: evaluate on seeds of a checkpoint's own demonstrations, which is refused otherwise.
+        to_the_end: play on after a success that is certain, so that success at the last step is known too.
     """
     from manicm_ms.evaluation.judge import evaluate
+    from manicm_ms.evaluation.results import without_rate
 
-    evaluate(
+    results = evaluate(
         _at_least_one(checkpoints, "checkpoint folder"), env, episodes, seed, out, num_envs=num_envs, backend=backend,
         device=device, control=control, videos=videos, threads=threads, realism=realism,
-        camera=camera, obs_preset=obs_preset, command=this_command(),
+        camera=camera, obs_preset=obs_preset, allow_seen_seeds=allow_seen_seeds, to_the_end=to_the_end,
+        command=this_command(),
     )  # fmt: skip
+    return 1 if without_rate(results) else 0
 
 
 def benchmark_command(

@@ -6,8 +6,6 @@ import json
 import re
 import shlex
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, replace
-from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
@@ -16,80 +14,34 @@ from rich.progress import Progress
 
 from manicm_ms.camera_model import CameraModel, read_camera
 from manicm_ms.devices import resolve_device, torch_threads
-from manicm_ms.errors import ConfigError, OutputExistsError, SpecMismatchError, require_at_least
+from manicm_ms.errors import ConfigError, OutputExistsError
+from manicm_ms.evaluation.contenders import (
+    CONTROL,
+    STUDENT,
+    TEACHER,
+    Contender,
+    checkpoint_digest,
+    load_contenders,
+    require_made_for,
+)
 from manicm_ms.evaluation.latency import Latency, measure_latency
-from manicm_ms.evaluation.machine import machine
+from manicm_ms.evaluation.origins import remarks, require_unseen
+from manicm_ms.evaluation.protocol import CLEAN, Conditions, Protocol
 from manicm_ms.evaluation.records import EpisodeLog, claimed_folder
-from manicm_ms.evaluation.report import crash_lines, paired_sentences, summary_tables, write_report
+from manicm_ms.evaluation.report import screen_lines, summary_tables, write_report
+from manicm_ms.evaluation.results import compile_results, realism_entry
 from manicm_ms.evaluation.rollout import EpisodeResult, RestartableEnv, rollout
-from manicm_ms.evaluation.statistics import compare_paired, success_rate
 from manicm_ms.evaluation.video import Take, choose_seeds, film
-from manicm_ms.paths import sha256, write_json
+from manicm_ms.paths import write_json
 from manicm_ms.progress import progress_bars, working
-from manicm_ms.provenance import package_versions
 from manicm_ms.realism import REALISM, RealismSample, parse_presets
-from manicm_ms.seeds import require_seed
-from manicm_ms.types import AGENT_POS, DP3_FRAME, ChunkSpec, EnvSpec, require_compatible
+from manicm_ms.types import AGENT_POS, ChunkSpec, EnvSpec, require_compatible
 
 if TYPE_CHECKING:
     from manicm_ms.envs.vec_env import VecEnv
     from manicm_ms.policies.base import Policy
 
-TEACHER, CONTROL, STUDENT = "teacher", "control", "student"
 OBS_PRESET = "manicm_ms"
-CLEAN = "clean"
-"""Realism preset of the ideal world."""
-SCHEMA_VERSION = 1
-
-Conditions = Callable[[str, int], RealismSample]
-"""(realism preset, seed) -> what is drawn for that episode beside its scene."""
-
-
-@dataclass(frozen=True)
-class Contender:
-    """A policy to be judged.
-
-    Attributes:
-        name: its name in tables and files, unique among the contenders.
-        role: "teacher", "control" or "student".
-        checkpoint: folder it was loaded from, as the caller named it.
-        policy: the policy itself, on the device it shall run on.
-    """
-
-    name: str
-    role: str
-    checkpoint: str
-    policy: Policy
-
-
-@dataclass(frozen=True)
-class Protocol:
-    """What is fixed about an evaluation beside its contenders.
-
-    Attributes:
-        env_id: the environment.
-        seeds: one episode each.
-        num_envs: rows that run in parallel; does not change the conditions of an episode.
-        threads: torch's intra-op threads while policies act and latency is measured.
-        repetitions: timed decisions per policy.
-        videos: seeds filmed, for each of teacher and student.
-        realism: presets under which every policy plays all seeds; the first is that of the main results and videos.
-    """
-
-    env_id: str
-    seeds: tuple[int, ...]
-    num_envs: int
-    threads: int = 1
-    repetitions: int = 50
-    videos: int = 4
-    realism: tuple[str, ...] = (CLEAN,)
-
-    def __post_init__(self) -> None:
-        if not self.seeds:
-            raise ConfigError("an evaluation needs at least one episode")
-        require_seed(min(self.seeds))
-        require_at_least(1, num_envs=self.num_envs, threads=self.threads, repetitions=self.repetitions)
-        require_at_least(0, videos=self.videos)
 
 
 class EnvMaker(NamedTuple):
@@ -123,19 +75,21 @@ def evaluate(
     realism: str = CLEAN,
     camera: Path | None = None,
     obs_preset: str = OBS_PRESET,
+    allow_seen_seeds: bool = False,
+    to_the_end: bool = True,
     command: str | None = None,
     console: Console | None = None,
 ) -> dict[str, Any]:
-    """Judge checkpoints on the same `episodes` fresh seeds and write results.json, report.md and report.html.
+    """Evaluate checkpoints on the same `episodes` fresh seeds and write results.json, report.md and report.html.
 
     The same call goes on where an earlier one was stopped, by Ctrl-C or by a kill: finished episodes are
     on disk and are not played again.
 
     Args:
-        checkpoints: checkpoint folders, the teacher first and the student last; one alone is judged without a pair.
+        checkpoints: checkpoint folders, the teacher first and the student last; one alone is evaluated without a pair.
         env_id: environment, for example "ur3e/slide-block".
         episodes: seeds seed, seed + 1, ..., seed + episodes - 1.
-        seed: the first seed; choose it beyond those of the demonstrations.
+        seed: the first seed, beyond those of the demonstrations.
         out: folder of records and report.
         num_envs: rows in parallel; None takes the machine's cores.
         backend: of `make_vec`.
@@ -147,6 +101,9 @@ def evaluate(
         realism: one or more presets, separated by commas: all policies play the same seeds under each of them.
         camera: YAML file of the cell's depth camera, as in `make_vec`.
         obs_preset: as in `make_vec`; the one of the demonstrations that the policies learnt from.
+        allow_seen_seeds: evaluate on seeds of a checkpoint's own demonstrations and say so; refused otherwise.
+        to_the_end: play on after a success that is certain, where the environment does, so that success at the end is
+            known; without it such episodes end at their success, which saves time.
         command: the command line to print in the report; None writes the equivalent of this call.
         console: where progress and table are printed; None is standard output.
 
@@ -164,17 +121,20 @@ def evaluate(
         raise ConfigError(f"--episodes must be at least 1, got {episodes}")
     seeds, presets = tuple(range(seed, seed + episodes)), parse_presets(realism)
     rows = min(default_num_envs() if num_envs is None else num_envs, episodes)
-    protocol = Protocol(env_id, seeds, rows, threads, repetitions, videos, presets)
-    model = None if camera is None else read_camera(camera)
     entry = ENVS.get(env_id)
+    protocol = Protocol(env_id, seeds, rows, threads, repetitions, videos, presets, to_the_end, entry.seed_limit)
+    model = None if camera is None else read_camera(camera)
     backend = resolve_backend(backend, entry)
     for preset in presets:
         entry.require(SimulatorConfig(realism=REALISM.get(preset), camera=model, obs_preset=obs_preset))
     contenders = load_contenders(checkpoints, device := str(resolve_device(device)), control)
-    _require_made_for(SimulatorConfig(obs_preset=obs_preset).specialise(entry.spec), contenders)
+    if not allow_seen_seeds:
+        require_unseen(contenders, env_id, seeds)
+    require_made_for(SimulatorConfig(obs_preset=obs_preset).specialise(entry.spec), contenders)
     request = _request(protocol, contenders, backend, device, model, obs_preset)
     envs = env_maker(env_id, backend, model, obs_preset)
-    command = command or _command(checkpoints, env_id, episodes, seed, out, realism, camera, obs_preset)
+    flags = (["--allow-seen-seeds"] if allow_seen_seeds else []) + ([] if to_the_end else ["--no-to-the-end"])
+    command = command or _command(checkpoints, env_id, episodes, seed, out, realism, camera, obs_preset, flags)
     return judge(contenders, protocol, envs, out, request, command, console or Console())
 
 
@@ -193,10 +153,15 @@ def _request(
         "episodes": len(protocol.seeds),
         "backend": backend,
         "device": device,
-        "policies": [[c.name, c.role, checkpoint_digest(c.checkpoint)] for c in contenders],
+        "policies": [[c.name, _place(i, c), checkpoint_digest(c.checkpoint)] for i, c in enumerate(contenders)],
         **_requested_realism(protocol.realism, camera),
         **({} if obs_preset == OBS_PRESET else {"obs_preset": obs_preset}),
     }
+
+
+def _place(index: int, contender: Contender) -> str:
+    """Return what folders of all versions call the place of a policy in the list; its role is another matter."""
+    return CONTROL if contender.role == CONTROL else STUDENT if index else TEACHER
 
 
 def _requested_realism(presets: tuple[str, ...], camera: CameraModel | None) -> dict[str, Any]:
@@ -232,53 +197,6 @@ def env_maker(env_id: str, backend: str, camera: CameraModel | None = None, obs_
     return EnvMaker(for_policy, for_film, conditions)
 
 
-def load_contenders(checkpoints: Sequence[Path], device: str = "cpu", control: bool = True) -> list[Contender]:
-    """Load the checkpoints, the first as teacher and the others as students, with the control row where asked.
-
-    Names are the folders' names, with their parents' where two are alike.
-    """
-    from manicm_ms.policies.checkpoint import load_checkpoint
-    from manicm_ms.policies.diffusion import DiffusionPolicy, OneStepTeacher
-
-    if not checkpoints:
-        raise ConfigError("name at least one checkpoint folder")
-    paths = [Path(p) for p in checkpoints]
-    names = [p.resolve().name for p in paths]
-    if len(set(names)) < len(names):
-        names = [f"{p.resolve().parent.name}/{p.resolve().name}" for p in paths]
-    if len(set(names)) < len(names):
-        raise ConfigError(f"two checkpoints have one name ({', '.join(names)}): judge different ones")
-    policies = [load_checkpoint(p, device=device) for p in paths]
-    contenders = [
-        Contender(name, TEACHER if i == 0 else STUDENT, str(path), policy)
-        for i, (name, path, policy) in enumerate(zip(names, paths, policies, strict=True))
-    ]
-    first = contenders[0]
-    if control and isinstance(first.policy, DiffusionPolicy):
-        one_step = OneStepTeacher(first.policy)
-        contenders.insert(1, Contender(f"{first.name}, one step", CONTROL, first.checkpoint, one_step))
-    return contenders
-
-
-def _require_made_for(spec: EnvSpec, contenders: Sequence[Contender]) -> None:
-    """Raise SpecMismatchError before anything is written where the environment cannot serve one of the policies."""
-    for contender in contenders:
-        theirs = contender.policy.spec
-        if theirs.obs.frame == DP3_FRAME != spec.obs.frame:
-            raise SpecMismatchError(
-                f"checkpoint {contender.checkpoint} learnt from clouds of the observation preset dp3: "
-                "add --obs-preset dp3"
-            )
-        # The environment is made with or without colours, as the policy wants.
-        offered = replace(spec, obs=replace(spec.obs, point_channels=theirs.obs.point_channels))
-        require_compatible(offered, theirs, f"environment {spec.env_id}", f"checkpoint {contender.checkpoint}")
-
-
-def checkpoint_digest(folder: str) -> str:
-    """Return what tells this checkpoint from another one under the same path: its manifest's SHA-256."""
-    return sha256(Path(folder) / "manifest.json")
-
-
 def judge(
     contenders: Sequence[Contender],
     protocol: Protocol,
@@ -288,7 +206,7 @@ def judge(
     command: str,
     console: Console,
 ) -> dict[str, Any]:
-    """Judge loaded policies; see `evaluate`, which loads them and makes real environments.
+    """Evaluate loaded policies; see `evaluate`, which loads them and makes real environments.
 
     Args:
         contenders: teacher first, student last.
@@ -300,13 +218,15 @@ def judge(
         console: where progress and table are printed.
     """
     with claimed_folder(out, request):
+        for remark in remarks(contenders, protocol.env_id, protocol.seeds):
+            console.print(remark, style="yellow", highlight=False, markup=False, soft_wrap=True)
         with working(console, "time the decisions"):
             latencies = _latencies(contenders, protocol, out / "latency.json")
         by_preset, spec = _play(contenders, protocol, envs, out, console)
         episodes = by_preset[protocol.realism[0]]
         results = compile_results(contenders, protocol, episodes, latencies, command, envs.conditions)
         if protocol.realism != (CLEAN,):
-            results["realism"] = _realism_entry(contenders, protocol, by_preset, envs.conditions)
+            results["realism"] = realism_entry(contenders, protocol, by_preset, envs.conditions)
         results["success_rule"] = spec.success_rule
         results["videos"] = []
         _write(results, out)  # before filming, which may fail or be stopped
@@ -314,7 +234,7 @@ def judge(
         _write(results, out)
     for table in summary_tables(results):
         console.print(table)
-    for sentence in (*paired_sentences(results), *crash_lines(results)):
+    for sentence in screen_lines(results):
         console.print(sentence, highlight=False, markup=False)
     console.print(f"report: {out / 'report.html'}", soft_wrap=True)
     return results
@@ -323,113 +243,6 @@ def judge(
 def _write(results: Mapping[str, Any], out: Path) -> None:
     write_json(out / "results.json", results)
     write_report(results, out)
-
-
-def compile_results(
-    contenders: Sequence[Contender],
-    protocol: Protocol,
-    episodes: Mapping[str, Sequence[EpisodeResult]],
-    latencies: Mapping[str, Latency],
-    command: str,
-    conditions: Conditions = lambda preset, seed: {},
-) -> dict[str, Any]:
-    """Return the content of results.json; every count in it is derived from the per-episode records here."""
-    drawn = partial(conditions, protocol.realism[0])
-    policies = [_policy_entry(c, episodes[c.name], latencies[c.name], drawn) for c in contenders]
-    return {
-        "schema_version": SCHEMA_VERSION,
-        "env_id": protocol.env_id,
-        "seeds": list(protocol.seeds),
-        "command": command,
-        "versions": package_versions(),
-        "machine": machine(),
-        "num_envs": protocol.num_envs,
-        "policies": policies,
-        "paired": _paired_entry(contenders[0], contenders[-1], episodes) if len(contenders) > 1 else None,
-    }
-
-
-def _policy_entry(
-    contender: Contender,
-    episodes: Sequence[EpisodeResult],
-    latency: Latency,
-    drawn: Callable[[int], RealismSample],
-) -> dict[str, Any]:
-    return {
-        "name": contender.name,
-        "role": contender.role,
-        "checkpoint": contender.checkpoint,
-        "nfe": contender.policy.nfe,
-        **_rate_entry(episodes),
-        "latency_ms": {"median": latency.median_ms, "p95": latency.p95_ms, "n": latency.n},
-        "device": latency.device,
-        "threads": latency.threads,
-        "dtype": latency.dtype,
-        "parameters": sum(p.numel() for p in contender.policy.parameters()),
-        "episodes": _episode_entries(episodes, drawn),
-    }
-
-
-def _rate_entry(episodes: Sequence[EpisodeResult]) -> dict[str, Any]:
-    rate = success_rate([e.success for e in episodes])
-    return {
-        "n": rate.n,
-        "successes": rate.successes,
-        "success_rate": rate.rate,
-        "ci95": list(rate.ci95),
-        "crashed": sum(e.crashed is not None for e in episodes),
-    }
-
-
-def _episode_entries(episodes: Sequence[EpisodeResult], drawn: Callable[[int], RealismSample]) -> list[dict[str, Any]]:
-    """Return the records of episodes, each with what was drawn for it where something was."""
-    return [e.summary() | ({"realism": values} if (values := drawn(e.seed)) else {}) for e in episodes]
-
-
-def _realism_entry(
-    contenders: Sequence[Contender],
-    protocol: Protocol,
-    by_preset: Mapping[str, Mapping[str, Sequence[EpisodeResult]]],
-    conditions: Conditions,
-) -> dict[str, Any]:
-    """Return how every policy fared under every preset, each against the same policy in the ideal world."""
-    presets = protocol.realism
-    reference = CLEAN if CLEAN in presets else presets[0]
-    rows = []
-    for preset in presets:
-        for contender in contenders:
-            ideal, episodes = (by_preset[name][contender.name] for name in (reference, preset))
-            rows.append({
-                "preset": preset,
-                "policy": contender.name,
-                "role": contender.role,
-                **_rate_entry(episodes),
-                "against_reference": None if preset == reference else _pair_entry(ideal, episodes),
-                "episodes": _episode_entries(episodes, partial(conditions, preset)),
-            })  # fmt: skip
-    return {"presets": list(presets), "reference": reference, "rows": rows}
-
-
-def _paired_entry(
-    first: Contender, second: Contender, episodes: Mapping[str, Sequence[EpisodeResult]]
-) -> dict[str, Any]:
-    return {
-        "first": first.name,
-        "second": second.name,
-        "difference_is": "success rate of the second minus that of the first",
-        **_pair_entry(episodes[first.name], episodes[second.name]),
-    }
-
-
-def _pair_entry(first: Sequence[EpisodeResult], second: Sequence[EpisodeResult]) -> dict[str, Any]:
-    """Return the comparison of two lists of episodes on the same seeds; `difference` is second minus first."""
-    pair = compare_paired([e.success for e in first], [e.success for e in second])
-    return {
-        **pair.counts._asdict(),
-        "difference": pair.difference,
-        "difference_ci95": list(pair.difference_ci95),
-        "mcnemar_p": pair.mcnemar_p,
-    }
 
 
 def _latencies(contenders: Sequence[Contender], protocol: Protocol, path: Path) -> dict[str, Latency]:
@@ -492,7 +305,10 @@ def _play_policy(
         if missing:
             home = bench.home(contender)
             with torch_threads(protocol.threads):  # more fight the workers for the cores
-                rollout(home, contender.policy, missing, on_episode=_recorder(log, progress, bar))
+                rollout(
+                    home, contender.policy, missing, on_episode=_recorder(log, progress, bar),
+                    to_the_end=protocol.to_the_end,
+                )  # fmt: skip
         results = [log[s] for s in protocol.seeds]
         progress.update(bar, successes=_successes(sum(e.success for e in results)))
     return results
@@ -617,9 +433,10 @@ def _command(
     realism: str,
     camera: Path | None,
     obs_preset: str,
+    flags: Sequence[str],
 ) -> str:
     words = ["manicm-ms", "evaluate", *map(str, checkpoints), "--env", env_id]
     words += ["--obs-preset", obs_preset] if obs_preset != OBS_PRESET else []
     words += ["--realism", realism] if realism != CLEAN else []
     words += ["--camera", str(camera)] if camera is not None else []
-    return shlex.join([*words, "--episodes", str(episodes), "--seed", str(seed), "--out", str(out)])
+    return shlex.join([*words, "--episodes", str(episodes), "--seed", str(seed), "--out", str(out), *flags])

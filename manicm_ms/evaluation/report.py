@@ -13,12 +13,21 @@ import jinja2
 from matplotlib.figure import Figure
 from rich.table import Table
 
+from manicm_ms.evaluation.results import INTERVALS, without_rate
 from manicm_ms.paths import write_text
 
 PAPER_LATENCY_MS = {"DP3, paper": 177.6, "ManiCM, paper": 17.3}
 """Mean decision times on an RTX 4090, milliseconds: ManiCM (arXiv:2406.01586), table of results, last column."""
 
-ROLE_COLORS = {"teacher": "#3b76c4", "control": "#8c93a0", "student": "#e07b39", "paper": "#b9bec7"}
+ROLE_COLORS = {
+    "teacher": "#3b76c4",
+    "control": "#8c93a0",
+    "student": "#e07b39",
+    "policy": "#5b9a68",
+    "paper": "#b9bec7",
+}
+
+NOTHING = "-"
 
 # Plots are drawn in this colour and then told to use the page's own, so that they follow light and dark.
 _INK = "#010203"
@@ -32,6 +41,8 @@ class Row(NamedTuple):
     nfe: str
     success: str
     interval: str
+    once: str
+    at_end: str
     crashed: str
     median: str
     p95: str
@@ -44,14 +55,15 @@ def rows(results: Mapping[str, Any]) -> list[Row]:
 
 
 def _row(policy: Mapping[str, Any]) -> Row:
-    low, high = policy["ci95"]
     threads = "1 thread" if policy["threads"] == 1 else f"{policy['threads']} threads"
     return Row(
         name=policy["name"],
         role=policy["role"],
         nfe=str(policy["nfe"]),
-        success=f"{policy['successes']}/{policy['n']} = {100 * policy['success_rate']:.1f} %",
-        interval=f"{100 * low:.1f} to {100 * high:.1f} %",
+        success=success_text(policy),
+        interval=interval_text(policy["ci95"]),
+        once=_count_text(policy.get("success_once")),
+        at_end=_count_text(policy.get("success_at_end")),
         crashed=str(policy["crashed"]),
         median=format_ms(policy["latency_ms"]["median"]),
         p95=format_ms(policy["latency_ms"]["p95"]),
@@ -59,12 +71,30 @@ def _row(policy: Mapping[str, Any]) -> Row:
     )
 
 
+def success_text(entry: Mapping[str, Any]) -> str:
+    """Return successes, episodes and rate; a dash for the rate where nothing was measured."""
+    rate = NOTHING if entry["success_rate"] is None else f"{100 * entry['success_rate']:.1f} %"
+    return f"{entry['successes']}/{entry['n']} = {rate}"
+
+
+def interval_text(ci95: Sequence[float] | None) -> str:
+    """Return an interval of a rate in percent; a dash where nothing was measured."""
+    return NOTHING if ci95 is None else f"{100 * ci95[0]:.1f} to {100 * ci95[1]:.1f} %"
+
+
+def _count_text(entry: Mapping[str, Any] | None) -> str:
+    return NOTHING if entry is None else f"{entry['successes']}/{entry['n']}"
+
+
 def format_ms(milliseconds: float) -> str:
     """Return a time with three significant digits, one decimal at least above 1 ms."""
     return f"{milliseconds:.3g} ms" if milliseconds < 10 else f"{milliseconds:.1f} ms"
 
 
-_HEADERS = ("Policy", "Role", "NFE", "Success", "95 % interval", "Crashed", "Decision", "p95", "Measured on")
+_HEADERS = (
+    "Policy", "Role", "NFE", "Success", "95 % interval", "Once", "At the end", "Crashed", "Decision", "p95",
+    "Measured on",
+)  # fmt: skip
 
 
 def paired_sentences(results: Mapping[str, Any]) -> list[str]:
@@ -73,12 +103,13 @@ def paired_sentences(results: Mapping[str, Any]) -> list[str]:
     if pair is None:
         return []
     low, high = pair["difference_ci95"]
+    method = results.get("intervals", INTERVALS)["difference"]
     n = pair["both"] + pair["only_first"] + pair["only_second"] + pair["neither"]
     sentences = [
         f"On the same {n} seeds both succeeded on {pair['both']}, only {pair['first']} on {pair['only_first']}, "
         f"only {pair['second']} on {pair['only_second']}, neither on {pair['neither']}.",
         f"Success rate of {pair['second']} minus that of {pair['first']}: {100 * pair['difference']:+.1f} points "
-        f"(95 % interval {100 * low:+.1f} to {100 * high:+.1f}; McNemar's exact test p = {pair['mcnemar_p']:.3g}).",
+        f"({method}, 95 %: {100 * low:+.1f} to {100 * high:+.1f}; McNemar's exact test p = {pair['mcnemar_p']:.3g}).",
     ]
     first, second = results["policies"][0]["latency_ms"]["median"], results["policies"][-1]["latency_ms"]["median"]
     sentences.append(
@@ -88,18 +119,31 @@ def paired_sentences(results: Mapping[str, Any]) -> list[str]:
     return sentences
 
 
+def once_at_end_sentence(results: Mapping[str, Any]) -> str:
+    """Return how often each policy succeeded at some step, and at the last one."""
+    told = [f"{row.name} {row.once}, {row.at_end}" for row in rows(results)]
+    return f"Success at some step, at the last step: {'; '.join(told)}."
+
+
 def crash_lines(results: Mapping[str, Any]) -> list[str]:
-    """Return one line per crashed episode, of all realism presets."""
+    """Return a line for each policy without a rate, then one per crashed episode, of all realism presets."""
+    silent = [f"{name}: every episode crashed, so there is no success rate." for name in without_rate(results)]
     entries = [(policy["name"], policy["episodes"]) for policy in results["policies"]]
     for row in results.get("realism", {"rows": []})["rows"]:
         if row["preset"] != results["realism"]["presets"][0]:  # those of the first stand among the policies
             entries.append((f"{row['policy']} under {row['preset']}", row["episodes"]))
-    return [
+    return silent + [
         f"{name}, seed {episode['seed']}: {episode['crashed']}"
         for name, episodes in entries
         for episode in episodes
         if episode["crashed"] is not None
     ]
+
+
+def screen_lines(results: Mapping[str, Any]) -> list[str]:
+    """Return what the command line prints below its tables."""
+    lines = [*results["remarks"], once_at_end_sentence(results)]
+    return [*lines, *paired_sentences(results), *crash_lines(results)]
 
 
 class RealismRow(NamedTuple):
@@ -109,13 +153,15 @@ class RealismRow(NamedTuple):
     policy: str
     success: str
     interval: str
+    once_at_end: str
     difference: str
     p: str
 
 
 def realism_headers(results: Mapping[str, Any]) -> tuple[str, ...]:
     """Return the headers of `realism_rows`."""
-    return ("Realism", "Policy", "Success", "95 % interval", f"Against {results['realism']['reference']}", "p")
+    against = f"Against {results['realism']['reference']}"
+    return ("Realism", "Policy", "Success", "95 % interval", "Once, at the end", against, "p")
 
 
 def realism_rows(results: Mapping[str, Any]) -> list[RealismRow]:
@@ -125,20 +171,28 @@ def realism_rows(results: Mapping[str, Any]) -> list[RealismRow]:
 
 
 def _realism_row(row: Mapping[str, Any]) -> RealismRow:
-    (low, high), pair = row["ci95"], row["against_reference"]
+    pair = row["against_reference"]
     difference, p = "", ""
     if pair is not None:
         least, most = (100 * bound for bound in pair["difference_ci95"])
         difference = f"{100 * pair['difference']:+.1f} points ({least:+.1f} to {most:+.1f})"
         p = f"{pair['mcnemar_p']:.3g}"
-    success = f"{row['successes']}/{row['n']} = {100 * row['success_rate']:.1f} %"
-    return RealismRow(row["preset"], row["policy"], success, f"{100 * low:.1f} to {100 * high:.1f} %", difference, p)
+    both = f"{_count_text(row.get('success_once'))}, {_count_text(row.get('success_at_end'))}"
+    interval = interval_text(row["ci95"])
+    return RealismRow(row["preset"], row["policy"], success_text(row), interval, both, difference, p)
 
 
 def realism_sentence(results: Mapping[str, Any]) -> str:
     """Return under which preset the main results were obtained; nothing in the ideal world."""
     realism = results.get("realism")
     return f"Realism preset of these episodes: {realism['presets'][0]}." if realism else ""
+
+
+def episodes_title(results: Mapping[str, Any]) -> str:
+    """Return what was played: fresh seeds, or seeds of which some were seen in training."""
+    count = len(results["seeds"])
+    kind = "seeds, some of them seen in training" if results.get("seen_seeds") else "fresh seeds"
+    return f"{count} {kind}"
 
 
 _PRINTED = ("name", "nfe", "success", "interval", "median", "p95")
@@ -201,13 +255,16 @@ def success_plot(results: Mapping[str, Any]) -> str:
     policies = results["policies"]
     figure, axes = _axes(len(policies))
     for y, policy in enumerate(policies):
+        if policy["success_rate"] is None:
+            axes.text(1, y, "every episode crashed", va="center", color=_INK)
+            continue
         rate, (low, high) = policy["success_rate"], policy["ci95"]
         axes.barh(y, 100 * rate, color=ROLE_COLORS[policy["role"]], height=0.62)
         error = [[100 * max(rate - low, 0)], [100 * max(high - rate, 0)]]
         axes.errorbar(100 * rate, y, xerr=error, color=_INK, capsize=4, lw=1.4)
         axes.text(103, y, f"{100 * rate:.1f} %", va="center", color=_INK)
     axes.set_xlim(0, 100)
-    axes.set_xlabel("success rate, % (bar) with 95 % Wilson interval")
+    axes.set_xlabel(f"success rate, % (bar) with 95 % {INTERVALS['rate']} interval")
     _label(axes, [p["name"] for p in policies])
     return _svg(figure, "Success rate of each policy with its 95 % interval")
 
@@ -279,6 +336,9 @@ def _context(results: Mapping[str, Any]) -> dict[str, Any]:
         "results": results,
         "headers": _HEADERS,
         "rows": rows(results),
+        "title": episodes_title(results),
+        "remarks": results.get("remarks", []),
+        "intervals": results.get("intervals", INTERVALS),
         "sentences": [*filter(None, [realism_sentence(results)]), *paired_sentences(results)],
         "realism_headers": realism_headers(results) if "realism" in results else (),
         "realism_rows": realism_rows(results),

@@ -7,7 +7,7 @@ import contextlib
 from collections import deque
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 import torch
@@ -37,6 +37,8 @@ class EpisodeResult:
         decisions: policy calls.
         total_return: sum of rewards.
         crashed: why the episode could not be played to its end, None where it was.
+        success_once: whether it succeeded at some step; None in records of earlier versions.
+        success_at_end: whether it succeeded at its last step; None where it was not played to its end.
         actions: (decisions, Ta, Da) float32, the actions commanded; with the seed they replay the episode.
     """
 
@@ -46,6 +48,8 @@ class EpisodeResult:
     decisions: int
     total_return: float
     crashed: str | None = None
+    success_once: bool | None = None
+    success_at_end: bool | None = None
     actions: np.ndarray = field(default_factory=lambda: np.zeros((0, 1, 1), np.float32), compare=False, repr=False)
 
     def to_record(self) -> dict[str, Any]:
@@ -58,6 +62,8 @@ class EpisodeResult:
         return {
             "seed": self.seed,
             "success": self.success,
+            "success_once": self.success_once,
+            "success_at_end": self.success_at_end,
             "steps": self.steps,
             "decisions": self.decisions,
             "return": self.total_return,
@@ -75,6 +81,8 @@ class EpisodeResult:
             decisions=int(record["decisions"]),
             total_return=float(record["return"]),
             crashed=record["crashed"],
+            success_once=record.get("success_once"),
+            success_at_end=record.get("success_at_end"),
             actions=flat.reshape(record["actions_shape"]),
         )
 
@@ -122,6 +130,7 @@ def rollout(
     seeds: Sequence[int],
     *,
     on_episode: Callable[[EpisodeResult], None] | None = None,
+    to_the_end: bool = False,
 ) -> list[EpisodeResult]:
     """Play one episode per seed and return the results in the order of `seeds`.
 
@@ -131,7 +140,8 @@ def rollout(
     2. The policy decides for all N rows at once, idle ones included, so that the batch keeps one size.
        Row i's noise is a function of its episode's seed and the number of the decision alone.
     3. The env plays the chunk in all rows. Rows that ended give their result; back to 1. Where success at some step
-       is enough (`success_rule` "any"), a row that has seen it has ended, whether or not the env goes on.
+       is enough (`success_rule` "any"), a row that has seen it has ended, whether or not the env goes on, unless
+       `to_the_end` is asked for.
     4. A row whose simulation or policy fails (error in the env, also at its reset, or an action that is not
        finite) is a failed episode with its reason. If the env itself dies (BackendError), all episodes in
        flight are failed ones; a `RestartableEnv` is restarted and the remaining seeds go on, any other env ends the
@@ -148,6 +158,8 @@ def rollout(
         policy: decides; it stays on its device and is put in evaluation mode.
         seeds: distinct non-negative integers.
         on_episode: called with each result as soon as it is known, in order of completion.
+        to_the_end: play on after a success that is certain (`success_rule` "any") until the env ends the episode, so
+            that `success_at_end` is known.
 
     Raises:
         ConfigError: seeds that repeat, or an env made for another chunk.
@@ -161,7 +173,7 @@ def rollout(
     require_compatible(env.env_spec, policy.spec, f"environment {env.env_spec.env_id}", "the policy")
     policy.eval()
     with torch.no_grad():
-        results = _Rollout(vec_env, policy, seeds, on_episode).run()
+        results = _Rollout(vec_env, policy, seeds, on_episode, to_the_end).run()
     return [results[seed] for seed in seeds]
 
 
@@ -185,11 +197,21 @@ class _Episode:
         self.total_return = 0.0
         self.actions: list[np.ndarray] = []  # each (Ta, Da)
 
-    def result(self, success: bool, crashed: str | None = None) -> EpisodeResult:
+    def result(self, outcome: _Outcome) -> EpisodeResult:
         actions = np.stack(self.actions) if self.actions else np.zeros((0, 1, 1), np.float32)
         return EpisodeResult(
-            self.seed, success and crashed is None, self.steps, len(self.actions), self.total_return, crashed, actions
-        )
+            self.seed, outcome.success, self.steps, len(self.actions), self.total_return, outcome.crashed,
+            outcome.success_once, outcome.success_at_end, actions,
+        )  # fmt: skip
+
+
+class _Outcome(NamedTuple):
+    """How an episode ended; the fields are those of `EpisodeResult`."""
+
+    success: bool = False
+    success_once: bool | None = False
+    success_at_end: bool | None = False
+    crashed: str | None = None
 
 
 class _Rollout:
@@ -201,10 +223,11 @@ class _Rollout:
         policy: Policy,
         seeds: Sequence[int],
         on_episode: Callable[[EpisodeResult], None] | None,
+        to_the_end: bool,
     ) -> None:
         self.home = vec_env if isinstance(vec_env, RestartableEnv) else None
         self.env: VecEnv = vec_env.env if isinstance(vec_env, RestartableEnv) else vec_env
-        self.policy, self.on_episode = policy, on_episode
+        self.policy, self.on_episode, self.to_the_end = policy, on_episode, to_the_end
         self.pending = deque(int(s) for s in seeds)
         self.rows: list[_Episode | None] = [None] * self.env.num_envs
         self.results: dict[int, EpisodeResult] = {}
@@ -236,7 +259,7 @@ class _Rollout:
         self.obs, info = self.env.reset(seed=seeds, options={"reset_mask": mask})
         for i in np.flatnonzero(fresh).tolist():
             if (error := info["error"][i]) is not None:
-                self._end(i, False, error)
+                self._end(i, _Outcome(crashed=error))
 
     def _decide(self) -> torch.Tensor:
         """Return actions (N, Ta, Da); end the episodes of rows whose action is not finite."""
@@ -253,7 +276,7 @@ class _Rollout:
             if finite[i]:
                 episode.actions.append(played[i].copy())
             else:
-                self._end(i, False, f"the policy's action {len(episode.actions)} is not finite")
+                self._end(i, _Outcome(crashed=f"the policy's action {len(episode.actions)} is not finite"))
         return actions.to(self.env.device)
 
     def _act(self, obs: Mapping[str, torch.Tensor], noise: torch.Tensor) -> torch.Tensor:
@@ -287,23 +310,26 @@ class _Rollout:
         ended = _numpy(terminated) | _numpy(truncated)
         steps = _numpy(info["elapsed_steps"])
         any_step = self.env.env_spec.success_rule == "any"
-        success = _numpy(info["success_once" if any_step else "success"])
+        now, once = _numpy(info["success"]), _numpy(info["success_once"])
+        certain = once if any_step and not self.to_the_end else np.zeros_like(once)
         for i, episode in enumerate(self.rows):
             if episode is None:
                 continue
             episode.total_return += float(np.nan_to_num(rewards[i]))
             episode.steps = int(steps[i])
-            error = info["error"][i]
-            if ended[i] or error is not None or (any_step and success[i]):
-                self._end(i, bool(success[i]), error)
+            if (error := info["error"][i]) is not None:
+                self._end(i, _Outcome(crashed=error))
+            elif ended[i] or certain[i]:
+                at_end = bool(now[i]) if ended[i] else None
+                self._end(i, _Outcome(bool(once[i] if any_step else now[i]), bool(once[i]), at_end))
 
-    def _end(self, row: int, success: bool, crashed: str | None) -> None:
+    def _end(self, row: int, outcome: _Outcome) -> None:
         episode = self.rows[row]
         assert episode is not None
         self.rows[row] = None
-        if crashed is None:
+        if outcome.crashed is None:
             self.restarts = 0
-        self.results[episode.seed] = result = episode.result(success, crashed)
+        self.results[episode.seed] = result = episode.result(outcome)
         if self.on_episode is not None:
             self.on_episode(result)
 
@@ -318,7 +344,7 @@ class _Rollout:
             ) from error
         for i, episode in enumerate(self.rows):
             if episode is not None:
-                self._end(i, False, f"the env died: {error}")
+                self._end(i, _Outcome(crashed=f"the env died: {error}"))
         self.obs = None
         self.home.restart()
         self.env = self.home.env

@@ -3,12 +3,14 @@
 import dataclasses
 import io
 import json
+from pathlib import Path
 
 import pytest
 from rich.console import Console
 
 from manicm_ms.envs.simulator import ENVS
 from manicm_ms.errors import CheckpointError, ConfigError, SpecMismatchError, UnknownNameError
+from manicm_ms.evaluation.contenders import load_contenders
 from manicm_ms.evaluation.judge import evaluate
 from manicm_ms.policies.base import make_policy
 from manicm_ms.policies.checkpoint import save_checkpoint
@@ -16,6 +18,7 @@ from manicm_ms.policies.manicm import ManiCM
 from manicm_ms.types import ChunkSpec
 
 ENV = "ur3e/slide-block"
+SHIPPED = Path(__file__).parents[2] / "checkpoints" / "slide_block"
 CONFIG = {"network": {"down_dims": (16, 32, 48), "max_points": 64}}
 
 
@@ -23,18 +26,18 @@ CONFIG = {"network": {"down_dims": (16, 32, 48), "max_points": 64}}
 def pair(tmp_path_factory):
     folder = tmp_path_factory.mktemp("pair")
     teacher = make_policy("simple_dp3", ENVS.get(ENV).spec, ChunkSpec(2, 4, 3), CONFIG, seed=0)
-    save_checkpoint(teacher, folder / "teacher", {})
+    save_checkpoint(teacher, folder / "teacher", {"data": {"env_id": ENV, "demo_seeds": [0, 7]}})
     save_checkpoint(ManiCM.from_teacher(teacher), folder / "student", {})
     return [folder / "teacher", folder / "student"]
 
 
-def run(checkpoints, out, env_id=ENV, episodes=2, **options):
+def run(checkpoints, out, env_id=ENV, episodes=2, seed=100_000, **options):
     console = Console(file=io.StringIO(), width=120)
     return evaluate(
         checkpoints,
         env_id,
         episodes,
-        100_000,
+        seed,
         out,
         num_envs=2,
         backend="cpu",
@@ -61,9 +64,27 @@ def test_a_pair_of_checkpoints_is_judged_with_its_control_and_filmed(pair, tmp_p
     assert str(pair[0]) in stored["command"]
 
 
-def test_without_control_only_the_checkpoints_are_judged(pair, tmp_path):
-    results = run(pair, tmp_path / "report", episodes=1, control=False, videos=0)
+def test_without_control_only_the_checkpoints_are_played_and_seen_seeds_may_be_meant(pair, tmp_path):
+    results = run(pair, tmp_path / "report", episodes=1, seed=0, control=False, videos=0, allow_seen_seeds=True)
     assert [p["name"] for p in results["policies"]] == ["teacher", "student"]
+    assert results["seen_seeds"] == {"teacher": 1}
+    assert results["command"].endswith("--allow-seen-seeds")
+    assert [p["success_at_end"]["n"] for p in results["policies"]] == [1, 1]
+
+
+def test_the_role_is_the_checkpoints_own(pair):
+    assert [(c.name, c.role) for c in load_contenders([pair[1]])] == [("student", "student")]
+    roles = [(c.name, c.role) for c in load_contenders(pair[::-1])]
+    assert roles == [("student", "student"), ("teacher", "teacher")]
+
+
+def test_seeds_of_its_own_demonstrations_are_refused_before_anything_is_written(tmp_path):
+    shipped = [SHIPPED / "teacher", SHIPPED / "student"]
+    with pytest.raises(ConfigError, match=r"are those of the demonstrations that checkpoint .*--allow-seen-seeds"):
+        run(shipped, tmp_path / "report", seed=0)
+    with pytest.raises(ConfigError, match="choose a smaller --seed"):
+        run(shipped, tmp_path / "report", seed=99_999_999_999)
+    assert not (tmp_path / "report").exists()
 
 
 def test_bad_input_is_refused_before_anything_is_written(pair, tmp_path):

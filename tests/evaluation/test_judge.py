@@ -10,19 +10,15 @@ from point_mass import SPEC, PointMass, Proportional
 from rich.console import Console
 
 from manicm_ms.errors import ConfigError, OutputExistsError, SpecMismatchError
-from manicm_ms.evaluation.judge import (
-    CONTROL,
-    STUDENT,
-    TEACHER,
-    Contender,
-    EnvMaker,
-    Protocol,
-    _require_made_for,
-    judge,
-)
+from manicm_ms.evaluation.contenders import CONTROL, STUDENT, TEACHER, Contender, require_made_for
+from manicm_ms.evaluation.intervals import rate_interval
+from manicm_ms.evaluation.judge import EnvMaker, judge
+from manicm_ms.evaluation.origins import Origin
+from manicm_ms.evaluation.protocol import Protocol
 from manicm_ms.evaluation.records import EpisodeLog
 from manicm_ms.evaluation.report import render_markdown
-from manicm_ms.evaluation.statistics import compare_paired, wilson_interval
+from manicm_ms.evaluation.results import without_rate
+from manicm_ms.evaluation.statistics import compare_paired
 
 SEEDS = tuple(range(100, 124))
 COMMAND = "manicm-ms evaluate teacher student --env toy/point-mass --episodes 24 --seed 100 --out report"
@@ -92,7 +88,7 @@ def test_every_number_derives_from_the_episode_records(report):
         assert policy["successes"] == sum(outcomes[policy["name"]])
         assert policy["n"] == len(SEEDS)
         assert policy["success_rate"] == policy["successes"] / len(SEEDS)
-        assert policy["ci95"] == list(wilson_interval(policy["successes"], len(SEEDS)))
+        assert policy["ci95"] == list(rate_interval(policy["successes"], len(SEEDS)))
         assert policy["crashed"] == 1
         assert policy["episodes"] == [e.summary() for e in episodes]
     pair = compare_paired(outcomes["teacher"], outcomes["student"])
@@ -210,6 +206,63 @@ def test_a_policy_alone_is_judged_without_a_pair(tmp_path):
     assert "On the same" not in render_markdown(results)
 
 
+def test_where_every_episode_crashed_there_is_no_rate(tmp_path):
+    seeds, out = SEEDS[:3], tmp_path / "report"
+    results, printed = run(out, seeds=seeds, crash_at=dict.fromkeys(seeds, 1), videos=1)
+    for policy in results["policies"]:
+        assert (policy["n"], policy["crashed"], policy["successes"]) == (3, 3, 0)
+        assert policy["success_rate"] is policy["ci95"] is policy["success_once"] is policy["success_at_end"] is None
+    assert results["paired"] is None
+    assert without_rate(results) == ["teacher", "teacher, one step", "student"]
+    assert "student: every episode crashed, so there is no success rate." in printed
+    for text in (printed, (out / "report.md").read_text(), (out / "report.html").read_text()):
+        assert "3 = -" in text
+        assert "0.0 %" not in text
+    mixed, _ = run(tmp_path / "mixed", seeds=seeds, crash_at=dict.fromkeys(seeds[:2], 1), videos=0)
+    assert without_rate(mixed) == []
+
+
+def test_success_at_some_step_and_at_the_last_stand_in_every_report(tmp_path):
+    out = tmp_path / "report"
+
+    def for_policy(policy, n, preset):
+        return PointMass(n, policy.chunk, goes_on=True)
+
+    protocol = Protocol(SPEC.env_id, SEEDS, num_envs=4, repetitions=1, videos=0)
+    envs, console = EnvMaker(for_policy, lambda n, _: PointMass(n, chunk=None)), Console(file=io.StringIO(), width=160)
+    restless = [Contender("restless", TEACHER, "runs/teacher", Proportional(gain=2.0, noise_scale=0.9))]
+    (policy,) = judge(restless, protocol, envs, out, {}, COMMAND, console)["policies"]
+    once, at_end = policy["success_once"], policy["success_at_end"]
+    assert once["successes"] == policy["successes"] > at_end["successes"]
+    assert at_end["ci95"] == list(rate_interval(at_end["successes"], len(SEEDS)))
+    assert at_end["successes"] == sum(e["success_at_end"] for e in policy["episodes"])
+    markdown = (out / "report.md").read_text()
+    assert f"| {once['successes']}/24 | {at_end['successes']}/24 |" in markdown
+    assert f"<td>{once['successes']}/24</td><td>{at_end['successes']}/24</td>" in (out / "report.html").read_text()
+    assert f"restless {once['successes']}/24, {at_end['successes']}/24" in console.file.getvalue()
+
+
+def test_what_a_checkpoint_was_made_for_and_has_seen_is_told_everywhere(tmp_path):
+    out = tmp_path / "report"
+    origin = Origin.read("toy/b", {"data": {"env_id": SPEC.env_id, "demo_seeds": list(SEEDS[:2])}})
+    stranger = dataclasses.replace(contenders()[2], origin=origin)
+    protocol = Protocol(SPEC.env_id, SEEDS[:4], num_envs=2, repetitions=1, videos=0)
+    envs = EnvMaker(lambda policy, n, _: PointMass(n, policy.chunk), lambda n, _: PointMass(n, chunk=None))
+    console = Console(file=io.StringIO(), width=80)
+    results = judge([contenders()[0], stranger], protocol, envs, out, {}, COMMAND, console)
+    assert results["seen_seeds"] == {"student": 2}
+    seen, other = results["remarks"]
+    assert "2 of the 4 seeds are those of its own demonstrations" in seen
+    assert "student was trained for toy/b and is evaluated on toy/point-mass" in other
+    assert [p["trained_for"] for p in results["policies"]] == [[], ["toy/b", "toy/point-mass"]]
+    for name in ("report.md", "report.html"):
+        text = (out / name).read_text()
+        assert seen in text
+        assert other in text
+        assert "fresh seeds" not in text.split("Results")[0].split("|")[0].replace(seen, "")
+    assert other in " ".join(console.file.getvalue().split())
+
+
 def test_names_cannot_break_the_page(tmp_path):
     hostile = dataclasses.replace(contenders()[0], name="<script>alert(1)</script>")
     protocol = Protocol(SPEC.env_id, SEEDS[:2], num_envs=2, repetitions=1, videos=1)
@@ -225,11 +278,15 @@ def test_a_senseless_protocol_is_refused():
         Protocol(SPEC.env_id, (1,), num_envs=0)
     with pytest.raises(ConfigError, match="seed must not be negative, got -3"):
         Protocol(SPEC.env_id, (-3, -2), num_envs=1)
+    with pytest.raises(ConfigError, match=r"end at 4294967295, and these run from 99999999999 to 99999999999"):
+        Protocol(SPEC.env_id, (99_999_999_999,), num_envs=1)
+    assert Protocol(SPEC.env_id, (2**32 - 1,), num_envs=1)
+    assert Protocol(SPEC.env_id, (99_999_999_999,), num_envs=1, seed_limit=2**63)
 
 
 def test_a_policy_of_the_dp3_preset_is_told_the_option_that_it_needs():
     theirs = dataclasses.replace(SPEC, obs=dataclasses.replace(SPEC.obs, frame="dp3"))
     contender = Contender("student", STUDENT, "runs/student", Proportional(spec=theirs))
     with pytest.raises(SpecMismatchError, match=r"runs/student learnt from clouds .* add --obs-preset dp3"):
-        _require_made_for(SPEC, [contender])
-    _require_made_for(theirs, [contender])
+        require_made_for(SPEC, [contender])
+    require_made_for(theirs, [contender])

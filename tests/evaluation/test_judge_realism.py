@@ -10,9 +10,12 @@ from point_mass import SPEC, PointMass, Proportional
 from rich.console import Console
 
 from manicm_ms.errors import ConfigError, OutputExistsError, UnknownNameError
-from manicm_ms.evaluation.judge import STUDENT, TEACHER, Contender, EnvMaker, Protocol, evaluate, judge, log_file
+from manicm_ms.evaluation.contenders import STUDENT, TEACHER, Contender
+from manicm_ms.evaluation.intervals import rate_interval
+from manicm_ms.evaluation.judge import EnvMaker, evaluate, judge, log_file
+from manicm_ms.evaluation.protocol import Protocol
 from manicm_ms.evaluation.records import EpisodeLog
-from manicm_ms.evaluation.statistics import compare_paired, wilson_interval
+from manicm_ms.evaluation.statistics import compare_paired
 from manicm_ms.realism import REALISM
 
 SEEDS = tuple(range(200, 216))
@@ -67,7 +70,7 @@ def test_rates_and_differences_derive_from_the_records(report):
         with EpisodeLog(log_file(out, "clean", row["policy"])) as log:
             ideal = [log[seed].success for seed in SEEDS]
         assert (row["n"], row["successes"]) == (len(SEEDS), sum(success))
-        assert row["ci95"] == list(wilson_interval(sum(success), len(SEEDS)))
+        assert row["ci95"] == list(rate_interval(sum(success), len(SEEDS)))
         if row["preset"] == "clean":
             assert row["against_reference"] is None
             continue

@@ -53,7 +53,9 @@ def test_the_page_shows_all_tasks_and_what_differs(script, played):
         assert f"- {task.title}: student minus teacher" in page
     assert "2.98 M parameters" in page
     assert "simulation" in page
-    assert "49 to\n  94 %" in page  # Wilson's interval of 8 in 10
+    assert "44 to\n  97 %" in page  # Clopper and Pearson's interval of 8 in 10
+    assert "Clopper-Pearson" in page
+    assert "Tango" in page
 
 
 def test_a_missing_pair_is_named_before_anything_is_played(script, tmp_path):

@@ -267,6 +267,31 @@ def test_an_episode_ends_with_the_chunk_that_makes_success_certain_though_the_en
         assert first.steps <= second.steps == limit
 
 
+def test_success_at_some_step_and_at_the_last_are_told_apart():
+    goes_on = PointMass(4, goes_on=True)
+    walks = rollout(goes_on, Proportional(gain=2.0, noise_scale=0.9), SEEDS, to_the_end=True)
+    cut = rollout(PointMass(4, goes_on=True), Proportional(gain=2.0, noise_scale=0.9), SEEDS)
+    assert {e.steps for e in walks} == {SPEC.max_episode_steps}
+    assert [e.success for e in walks] == [e.success_once for e in walks] == [e.success for e in cut]
+    for episode in walks:  # the truth: where the recorded actions lead
+        pos = np.random.default_rng(episode.seed).uniform(-1, 1, 2)
+        distances = []
+        for action in np.clip(episode.actions.reshape(-1, 2)[: episode.steps], -1, 1).astype(np.float64):
+            pos = pos + DT * action
+            distances.append(np.linalg.norm(pos))
+        assert episode.success_once == (min(distances) < REACH)
+        assert episode.success_at_end == (distances[-1] < REACH)
+    assert any(e.success_once and not e.success_at_end for e in walks)
+    # An episode that was cut off at its success has an unknown end; the others ended by their time limit.
+    assert {(e.success, e.success_at_end) for e in cut} == {(True, None), (False, False)}
+
+
+def test_where_success_ends_the_episode_both_are_one():
+    assert all(e.success == e.success_once == e.success_at_end for e in rollout(PointMass(4), Proportional(), SEEDS))
+    crashed = rollout(PointMass(2, crash_at=dict.fromkeys(SEEDS, 1)), Proportional(), SEEDS[:4])
+    assert {(e.success, e.success_once, e.success_at_end) for e in crashed} == {(False, False, False)}
+
+
 def test_where_success_must_last_nothing_ends_early():
     spec = dataclasses.replace(SPEC, success_rule="last")
     results = rollout(PointMass(4, goes_on=True, spec=spec), Proportional(spec=spec), SEEDS)

@@ -1,0 +1,55 @@
+"""What is fixed about an evaluation beside its policies."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+from manicm_ms.errors import ConfigError, require_at_least
+from manicm_ms.realism import RealismSample
+from manicm_ms.seeds import require_seed
+
+CLEAN = "clean"
+"""Realism preset of the ideal world."""
+
+Conditions = Callable[[str, int], RealismSample]
+"""(realism preset, seed) -> what is drawn for that episode beside its scene."""
+
+
+@dataclass(frozen=True)
+class Protocol:
+    """What is fixed about an evaluation beside its policies.
+
+    Attributes:
+        env_id: the environment.
+        seeds: one episode each.
+        num_envs: rows that run in parallel; does not change the conditions of an episode.
+        threads: torch's intra-op threads while policies act and latency is measured.
+        repetitions: timed decisions per policy.
+        videos: seeds filmed, for each of teacher and student.
+        realism: presets under which every policy plays all seeds; the first is that of the main results and videos.
+        to_the_end: play on after a success that is certain, so that success at the end is known; see `rollout`.
+        seed_limit: seeds lie below it; see `EnvEntry`.
+    """
+
+    env_id: str
+    seeds: tuple[int, ...]
+    num_envs: int
+    threads: int = 1
+    repetitions: int = 50
+    videos: int = 4
+    realism: tuple[str, ...] = (CLEAN,)
+    to_the_end: bool = True
+    seed_limit: int = 2**32
+
+    def __post_init__(self) -> None:
+        if not self.seeds:
+            raise ConfigError("an evaluation needs at least one episode")
+        require_seed(min(self.seeds))
+        if max(self.seeds) >= self.seed_limit:
+            raise ConfigError(
+                f"seeds of {self.env_id} end at {self.seed_limit - 1}, and these run from {min(self.seeds)} to "
+                f"{max(self.seeds)}: choose a smaller --seed"
+            )
+        require_at_least(1, num_envs=self.num_envs, threads=self.threads, repetitions=self.repetitions)
+        require_at_least(0, videos=self.videos)
