@@ -21,6 +21,7 @@ from rich.progress import (
     TimeElapsedColumn,
     TimeRemainingColumn,
 )
+from rich.text import Text
 
 PERIOD_S = 30.0
 """Seconds between two lines of work whose output is no terminal."""
@@ -36,7 +37,7 @@ def progress_bars(console: Console | None, *notes: str) -> Progress:
         console: where; None shows nothing.
         notes: formats of rich's `TextColumn`, as in "loss {task.fields[loss]:.4g}", shown behind the count.
     """
-    told: list[ProgressColumn] = [MofNCompleteColumn(), *map(TextColumn, notes)]
+    told: list[ProgressColumn] = [_Count(), *map(TextColumn, notes)]
     if console is None:
         return Progress(*told, disable=True)
     if not (console.is_terminal or console.is_jupyter):
@@ -67,6 +68,13 @@ def working(console: Console | None, description: str) -> Iterator[None]:
     with shown:
         shown.add_task(description, total=None)
         yield
+
+
+class _Count(MofNCompleteColumn):
+    """How many of how many, and where that is unknown, how many."""
+
+    def render(self, task: Task) -> Text:
+        return Text(f"{task.completed:.0f}") if task.total is None else super().render(task)
 
 
 class LineProgress(Progress):
@@ -101,13 +109,13 @@ class LineProgress(Progress):
         self._watch.start()
 
     def stop(self) -> None:
-        """Write the last state of every task that got somewhere, unless it has been told to be finished."""
+        """Write the last state of every counted task that got somewhere, unless it has been told to be finished."""
         if self._watch is None:
             return
         self._ended.set()
         self._watch.join()
         self._watch = None
-        self._write(least=1)
+        self._write(ending=True)
 
     def tick(self) -> None:
         """Write the lines if it is time to."""
@@ -122,9 +130,11 @@ class LineProgress(Progress):
         while not self._ended.wait(_LOOK_S):
             self.tick()
 
-    def _write(self, least: int = 0) -> None:
+    def _write(self, ending: bool = False) -> None:
         for task in self.tasks:
-            if task.visible and task.completed >= least and task.id not in self._finished:
+            if not task.visible or task.id in self._finished:
+                continue
+            if not ending or (task.total is not None and task.completed):
                 self.console.print(self._line(task), markup=False, highlight=False, soft_wrap=True)
                 if task.finished:
                     self._finished.add(task.id)

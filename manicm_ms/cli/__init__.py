@@ -14,6 +14,7 @@ signals.quiet_start(("manicm-ms", "-m"))  # before the imports, which take a whi
 import errno
 import shlex
 import sys
+import textwrap
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Annotated, Any, Literal
@@ -364,17 +365,16 @@ def calibrate_command(
         legacy: the board was made by OpenCV before 4.6.
         overwrite: replace the camera file where there is one.
     """
-    from rich.console import Console
-
     from manicm_ms.calibration import CharucoSpec, calibrate
     from manicm_ms.cli.calibration import progress, report
+    from manicm_ms.cli.listing import console
 
     board = CharucoSpec(*squares, square_length, marker_length, dictionary, legacy)
     with progress() as on_image:
         solved = calibrate(
             images, board, out, poses=poses, intrinsics=intrinsics, overwrite=overwrite, on_image=on_image
         )
-    report(solved, Console())
+    report(solved, console())
     print(f"{out} written")
 
 
@@ -481,10 +481,13 @@ def _command(name: str, arguments: list[str]) -> Command:
 
 
 def _overview() -> None:
+    from manicm_ms.cli.listing import console
+
     print(f"usage: {PROGRAM} COMMAND ...   ('{PROGRAM} COMMAND --help' tells more)\n")
     plain = {name: (command.__doc__ or "").splitlines()[0] for name, command in _PLAIN.items()}
+    width = console().width
     for name, summary in {**plain, **_WITH_PRESET}.items():
-        print(f"  {name:<9} {summary}")
+        print(textwrap.fill(f"  {name:<9} {summary}", width, subsequent_indent=" " * 12, break_on_hyphens=False))
 
 
 def _explain(error: OSError) -> str:

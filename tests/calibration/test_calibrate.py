@@ -110,6 +110,7 @@ def test_the_command_finds_the_camera_with_given_intrinsics(session, tmp_path, c
     assert status == 0
     assert "reprojection error 0." in printed
     assert "spread between views" in printed
+    assert any(line.startswith("noise of corners") and line.endswith("of its size") for line in printed.splitlines())
     assert all(name in printed for name in session[1])
     millimetres, degrees = error(read_pose(out))
     assert millimetres < 0.3  # wanted: 2 mm and 0.3 degrees

@@ -51,6 +51,13 @@ def test_every_list_fits_and_cuts_nothing_off(shown, command, width):
     assert all(name in words for name in NAMES[command]())
 
 
+def test_the_overview_fits_the_terminal(shown, capsys):
+    shown(80, "--help")
+    lines = capsys.readouterr().out.splitlines()
+    assert max(map(len, lines)) <= 80
+    assert any(line.startswith(" " * 12) for line in lines), "summaries go on in their own column"
+
+
 def test_what_is_told_of_an_environment_is_the_same_in_any_width(shown):
     spec = ENVS.get("ur3e/slide-block").spec
     styles = ", ".join(EXPERTS.get("ur3e/slide-block").styles)
