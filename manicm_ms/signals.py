@@ -7,18 +7,20 @@ was started from it. So a program that starts others must say which of them answ
 from __future__ import annotations
 
 import contextlib
-import multiprocessing
 import os
 import signal
 import sys
 import threading
+import time
 from collections.abc import Iterator
-from multiprocessing import resource_tracker
 from types import FrameType
 from typing import Any
 
+# multiprocessing is imported where it is used: it takes long, and a command should come to `quiet_start` at once.
+
 STOPPING = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
-_AGAIN_S = 0.05
+_AGAIN_S = 0.3  # between two looks whether an interrupt has arrived
+_PATIENCE = 3  # so many signals of the user's are obeyed even in the middle of tidying up
 _END_S = 5.0  # how long a child may take to end when asked, before it is killed
 
 
@@ -65,6 +67,8 @@ def spared_children() -> Iterator[None]:
 
     They inherit a mask that blocks SIGINT; here it takes effect again, late by a moment, when the block ends.
     """
+    from multiprocessing import resource_tracker
+
     resource_tracker.ensure_running()  # Python 3.11 lifts the mask after starting it
     before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
     try:
@@ -75,6 +79,8 @@ def spared_children() -> Iterator[None]:
 
 def end_with_parent() -> None:
     """End this process at once when the one that started it has ended, be it killed."""
+    import multiprocessing
+
     parent = multiprocessing.parent_process()
     if parent is None:
         return
@@ -100,7 +106,6 @@ def end_processes(processes: list[Any], patience_s: float = _END_S) -> None:
 # ---- programs -------------------------------------------------------------------------------------------------------
 
 _program = False  # whether this process runs one of ours, so that signals are ours to answer
-_asked: int | None = None  # the signal that last raised `Stopped`
 
 
 def quiet_start(programs: tuple[str, ...]) -> None:
@@ -119,35 +124,83 @@ def quiet_start(programs: tuple[str, ...]) -> None:
 def stoppable() -> Iterator[None]:
     """Raise `Stopped` in the main thread at Ctrl-C, SIGTERM and SIGHUP while the block runs.
 
-    An interrupt that Python drops, because it came while an object was being destroyed, comes again; one that a library
-    made an error of its own (an import of compiled code does) is told from others. When the block of a program has
-    ended, its work is done or given up: nothing interrupts the rest, which is short.
+    Libraries lose such an interrupt now and then: they catch everything around an optional import, make an error of
+    their own of it, or are destroying an object. So it is raised again until it arrives; but not into the tidying up
+    that it has set off, unless the user insists. When the block of a program has ended, its work is done or given up:
+    nothing interrupts the rest, which is short.
     """
-    global _asked
-    _asked = None
     if threading.current_thread() is not threading.main_thread():
         yield
         return
     before = {number: signal.getsignal(number) for number in _answered()}
     hook = sys.unraisablehook
-    sys.unraisablehook = _again(hook)
+    asked = _Asked()
+    sys.unraisablehook = lambda dropped: None if isinstance(dropped.exc_value, Stopped) else hook(dropped)
     try:
         for number in before:
-            signal.signal(number, _raise)
+            signal.signal(number, asked.answer)
         yield
     except Exception:
-        if _asked is not None:
-            raise Stopped(_asked) from None
+        if asked.number is not None:
+            raise Stopped(asked.number) from None
         raise
     finally:
-        for number, handler in before.items():
-            signal.signal(number, signal.SIG_IGN if _program else handler)
+        with asked.over:
+            asked.number = None
+            for number, handler in before.items():
+                signal.signal(number, signal.SIG_IGN if _program else handler)
         sys.unraisablehook = hook
+
+
+class _Asked:
+    """The signals that came in a `stoppable` block.
+
+    Attributes:
+        number: the first of them; None where there was none, and when the block is over.
+        over: held while the block ends, so that no signal is sent after it.
+    """
+
+    def __init__(self) -> None:
+        self.number: int | None = None
+        self.over = threading.Lock()
+        self._count = 0
+        self._mine = False
+
+    def answer(self, number: int, frame: FrameType | None) -> None:
+        """Raise `Stopped` where nothing is being tidied up because of it yet, or the user has asked often."""
+        self._count += not self._mine
+        self._mine = False
+        if self.number is None:
+            self.number = number
+            threading.Thread(target=self._insist, args=(number,), daemon=True).start()
+        if self._count >= _PATIENCE or not _tidying_up():
+            raise Stopped(number)
+
+    def _insist(self, number: int) -> None:
+        """Send the signal again and again until the block is over; other handlers than ours are left in peace."""
+        while True:
+            time.sleep(_AGAIN_S)
+            with self.over:
+                if self.number is None:
+                    return
+                if signal.getsignal(number) == self.answer:
+                    self._mine = True
+                    os.kill(os.getpid(), number)
+
+
+def _tidying_up() -> bool:
+    """Return whether an interrupt, or an error that followed from one, is being handled in the main thread."""
+    error = sys.exc_info()[1]
+    while error is not None and not isinstance(error, KeyboardInterrupt):
+        error = error.__context__
+    return error is not None
 
 
 def settle() -> None:
     """End the child processes of a program that was stopped; elsewhere they are not ours to end."""
     if _program:
+        import multiprocessing
+
         end_processes(multiprocessing.active_children())
 
 
@@ -156,25 +209,6 @@ def _answered() -> list[int]:
     return [number for number in STOPPING if signal.getsignal(number) not in (signal.SIG_IGN, None)]
 
 
-def _raise(number: int, frame: FrameType | None) -> None:
-    global _asked
-    _asked = number
-    raise Stopped(number)
-
-
 def _end_at_once(number: int, frame: FrameType | None) -> None:
     os.write(2, b"stopped\n")
     os._exit(128 + number)
-
-
-def _again(hook: Any) -> Any:
-    def see(dropped: Any) -> None:
-        if isinstance(dropped.exc_value, Stopped):
-            # A moment later: here, too, it would be dropped.
-            later = threading.Timer(_AGAIN_S, os.kill, (os.getpid(), dropped.exc_value.status - 128))
-            later.daemon = True
-            later.start()
-        else:
-            hook(dropped)
-
-    return see

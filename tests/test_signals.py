@@ -90,6 +90,44 @@ def test_an_interrupt_that_a_library_made_an_error_of_its_own_still_stops():
         raise ImportError("plain")
 
 
+def test_an_interrupt_that_a_library_swallowed_comes_again():
+    """As trimesh does, which catches BaseException around each of its optional imports."""
+    swallowed = []
+
+    def block():
+        with signals.stoppable():
+            try:
+                os.kill(os.getpid(), signal.SIGINT)
+                time.sleep(5)
+            except BaseException as error:
+                swallowed.append(error)
+            time.sleep(30)
+
+    with pytest.raises(signals.Stopped):
+        block()
+    assert len(swallowed) == 1
+
+
+@pytest.mark.parametrize(("signals_sent", "whole"), [(2, True), (3, False)])
+def test_tidying_up_is_not_interrupted_unless_the_user_insists(signals_sent, whole):
+    tidied = []
+
+    def block():
+        with signals.stoppable():
+            try:
+                os.kill(os.getpid(), signal.SIGINT)
+                time.sleep(5)
+            finally:
+                for _ in range(signals_sent - 1):
+                    os.kill(os.getpid(), signal.SIGINT)
+                time.sleep(1)  # longer than until it comes again
+                tidied.append(True)
+
+    with pytest.raises(signals.Stopped):
+        block()
+    assert bool(tidied) == whole
+
+
 def test_an_interrupt_while_an_object_is_destroyed_is_not_lost():
     class Thing:
         pass

@@ -33,7 +33,8 @@ class StableBaselinesEnv(StableVecEnv):
     lower rate than the controller runs; rewards are summed over them, and of the history the last frame is returned.
 
     Args:
-        env: the environment; an observation of one key becomes a plain array, of several a dictionary.
+        env: the environment, in torch tensors or NumPy arrays. An observation of one key becomes a plain array, of
+            several a dictionary.
         seed: of the first episode.
 
     Raises:
@@ -42,13 +43,13 @@ class StableBaselinesEnv(StableVecEnv):
 
     def __init__(self, env: VecEnv, seed: int = 0) -> None:
         require_seed(seed)
-        self.env = env
+        self.env = env = env.unwrapped  # also of an environment with NumPy arrays
         self._next_seed = seed
         self._keys: tuple[str, ...] = tuple(env.single_observation_space)  # type: ignore[arg-type]  # a Dict space
         self._held = env.chunk.n_action_steps if env.chunk else 1
         spaces_of_rows = observation_space(env.env_spec, self._keys, None)
         self._actions = np.zeros((env.num_envs, env.env_spec.action.dim), np.float32)
-        self.render_mode: str | None = None  # Stable-Baselines3 asks for it before it sets it
+        self.render_mode = env.render_mode  # Stable-Baselines3 asks for it before it sets it
         space = spaces_of_rows[self._keys[0]] if len(self._keys) == 1 else spaces_of_rows
         super().__init__(env.num_envs, space, action_space(env.env_spec, None))
 
@@ -82,8 +83,13 @@ class StableBaselinesEnv(StableVecEnv):
         self.env.close()
 
     def get_attr(self, attr_name: str, indices: VecEnvIndices = None) -> list[Any]:
-        """Return an attribute of this adapter once a row: its rows share one object."""
-        return [getattr(self, attr_name)] * len(list(self._get_indices(indices)))
+        """Return an attribute of this adapter, else of its environment, once a row: the rows share one object."""
+        owner = self if hasattr(self, attr_name) else self.env
+        return [getattr(owner, attr_name)] * len(list(self._get_indices(indices)))
+
+    def get_images(self) -> Sequence[NDArray[np.uint8] | None]:
+        """Return what the wide camera sees, (H, W, 3) uint8 a row; needs `make_vec(..., video=True)`."""
+        return list(self.env.render())
 
     def set_attr(self, attr_name: str, value: Any, indices: VecEnvIndices = None) -> None:
         """Refuse: rows have no attributes of their own."""

@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 import torch
+from gymnasium.envs.registration import EnvSpec as GymnasiumSpec
 from gymnasium.vector import AutoresetMode, VectorEnv
 from gymnasium.vector.utils import batch_space
 from numpy.typing import ArrayLike, NDArray
@@ -37,6 +38,7 @@ class VecEnv(VectorEnv[Obs, Tensor, Tensor]):
 
     Attributes:
         env_spec: what is fixed about the environment.
+        spec: Gymnasium's word for it: id and time limit.
         chunk: history and chunk lengths, or None.
         device: where the tensors live.
         backend: "cpu" or "gpu".
@@ -52,6 +54,7 @@ class VecEnv(VectorEnv[Obs, Tensor, Tensor]):
         self, entry: EnvEntry, spec: EnvSpec, num_envs: int, config: SimulatorConfig, chunk: ChunkSpec | None
     ) -> None:
         self.env_spec, self.num_envs, self.chunk = spec, num_envs, chunk
+        self.spec = GymnasiumSpec(spec.env_id, max_episode_steps=spec.max_episode_steps)
         decisions_hz = spec.action.control_hz / (chunk.n_action_steps if chunk else 1)
         self.metadata = {
             "autoreset_mode": self.autoreset_mode,

@@ -136,6 +136,8 @@ def test_an_action_is_held_for_a_chunk():
 
 def test_rows_have_no_attributes_or_methods_of_their_own(venv):
     assert venv.get_attr("render_mode") == [None, None]
+    with pytest.raises(ConfigError, match="video=True"):
+        venv.get_images()
     assert venv.env_is_wrapped(VecMonitor) == [False, False]
     with pytest.raises(ConfigError, match="gravity"):
         venv.set_attr("gravity", 0)
@@ -143,6 +145,22 @@ def test_rows_have_no_attributes_or_methods_of_their_own(venv):
         venv.env_method("explode")
     with pytest.raises(ConfigError, match="negative"):
         venv.seed(-1)
+
+
+def test_pictures_and_the_spec_are_those_of_the_environment():
+    env = make_vec(SOUND, 2, "cpu", obs=(STATE,), video=True, arrays="numpy")
+    try:
+        venv = StableBaselinesEnv(env, seed=10)
+        np.testing.assert_allclose(venv.reset(), [start(10), start(11)])
+        images = venv.get_images()
+        assert venv.render_mode == "rgb_array"
+        assert [image.shape for image in images] == [(4, 4, 3)] * 2
+        assert venv.render().shape == (8, 4, 3), "both rows in one picture"
+        assert [spec.id for spec in venv.get_attr("spec")] == [SOUND] * 2
+        assert venv.get_attr("spec", indices=0)[0].max_episode_steps == MAX_STEPS
+        assert venv.get_attr("env_spec")[0].env_id == SOUND
+    finally:
+        env.close()
 
 
 # ---- what an ended episode is worth ---------------------------------------------------------------------------------
