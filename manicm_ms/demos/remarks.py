@@ -7,7 +7,7 @@ A remark is one line that holds the number and the likely cause: a unit, a frame
 from __future__ import annotations
 
 import re
-from collections.abc import Collection, Iterator, Mapping
+from collections.abc import Collection, Iterable, Iterator, Mapping
 
 import numpy as np
 
@@ -28,7 +28,11 @@ _LIMITS: Mapping[str, tuple[float, str]] = {
 }
 """Unit -> the most that a robot's entry of this unit reaches, and the unit that it likely is in where it is more."""
 _OUTER = (0.5, 99.5)  # per cent; what lies outside is rare
+_FEWEST = 20  # frames, else one of them is no rarity
 _STRETCH = 100.0  # a normaliser whose range is this many times that of 99 % of the values wastes it
+_OUTER_POINTS = (0.05, 99.95)  # per cent of the coordinates of points, which are more, and crowd more evenly
+_STRETCH_POINTS = 5.0
+_FRAMES_LOOKED_AT = 100  # for where the bulk of the points is
 _BLOCK_FRAMES = 512
 _SMALLEST = 5e-3  # m; no cloud of a scene is smaller
 
@@ -73,7 +77,7 @@ def field_remarks(name: str, frames: np.ndarray, spec: EnvSpec) -> list[str]:
     if name == "depth":
         return list(_depth(frames))
     if name == "agent_pos":
-        return [*_units(name, frames, spec.agent_pos_names), *_stray(name, frames, spec.agent_pos_names)]
+        return [*_units(name, frames, spec.agent_pos_names), *_stray_entries(name, frames, spec.agent_pos_names)]
     if name == "action":
         return list(_idle(frames))
     return []
@@ -130,13 +134,20 @@ def metres_remark(what: str, reach: float, share: float, most: float) -> str:
 def _cloud(clouds: np.ndarray) -> Iterator[str]:
     far, points, low, high = 0, 0, np.full(clouds.shape[-1], np.inf), np.full(clouds.shape[-1], -np.inf)
     for block in _finite_blocks(clouds):
-        far += int((np.abs(block[..., :3]) > MOST_METRES).any(axis=-1).sum())
+        least, greatest = block.min(axis=(0, 1)), block.max(axis=(0, 1))
+        if max(-least[:3].min(), greatest[:3].max()) > MOST_METRES:
+            far += int((np.abs(block[..., :3]) > MOST_METRES).any(axis=-1).sum())
         points += block[..., 0].size
-        low, high = np.minimum(low, block.min(axis=(0, 1))), np.maximum(high, block.max(axis=(0, 1)))
+        low, high = np.minimum(low, least), np.maximum(high, greatest)
     if not points:
         return
     if far:
         yield metres_remark("point_cloud", float(np.maximum(-low, high)[:3].max()), far / points, MOST_METRES)
+    else:
+        looked_at = np.linspace(0, len(clouds) - 1, min(len(clouds), _FRAMES_LOOKED_AT)).astype(int)
+        bulk = next(_finite_blocks(clouds[looked_at, :, :3])).reshape(-1, 3)
+        inner = np.percentile(bulk, _OUTER_POINTS, axis=0)
+        yield from _stray("point_cloud", ("x (m)", "y (m)", "z (m)"), inner, (low[:3], high[:3]), _STRETCH_POINTS)
     if 0 < (extent := float((high - low)[:3].max())) < _SMALLEST:
         yield f"point_cloud spans {1000 * extent:.2g} mm in all: its unit is likely not the metre"
     if (low[3:] < -COLOR_SLACK).any() or (high[3:] > 1 + COLOR_SLACK).any():
@@ -157,7 +168,8 @@ def _finite_blocks(frames: np.ndarray) -> Iterator[np.ndarray]:
     """Yield frames (F, ...) block by block, zeros in place of what is not finite."""
     for start in range(0, len(frames), _BLOCK_FRAMES):
         block = frames[start : start + _BLOCK_FRAMES]
-        yield np.where(np.isfinite(block), block, 0)
+        finite = np.isfinite(block)
+        yield block if finite.all() else np.where(finite, block, 0)
 
 
 def _units(field: str, values: np.ndarray, names: tuple[str, ...]) -> Iterator[str]:
@@ -171,20 +183,32 @@ def _units(field: str, values: np.ndarray, names: tuple[str, ...]) -> Iterator[s
             yield f"{name}{others} of {field} reaches {worst:.4g}, over {most:.3g} {unit}: likely {likely}"
 
 
-def _stray(field: str, values: np.ndarray, names: tuple[str, ...]) -> Iterator[str]:
-    """Yield a line for each entry of which rare values stretch the range that a normaliser maps to [-1, 1]."""
-    if len(values) < 20:
-        return
-    kept = np.where(np.isfinite(values), values, np.nan)
-    low, high = np.nanmin(kept, axis=0), np.nanmax(kept, axis=0)
-    inner_low, inner_high = np.nanpercentile(kept, _OUTER, axis=0)
-    for k, name in enumerate(names):
-        inner = inner_high[k] - inner_low[k]
-        if inner > 1e-4 and high[k] - low[k] > _STRETCH * inner:
+def _stray_entries(field: str, values: np.ndarray, names: tuple[str, ...]) -> Iterator[str]:
+    """Yield the lines of `_stray` about entries (F, D) of which there are enough to tell what is rare."""
+    if len(values) >= _FEWEST:
+        kept = np.where(np.isfinite(values), values, np.nan)
+        inner = np.nanpercentile(kept, _OUTER, axis=0)
+        yield from _stray(field, names, inner, (np.nanmin(kept, axis=0), np.nanmax(kept, axis=0)), _STRETCH)
+
+
+def _stray(
+    field: str, names: tuple[str, ...], inner: Iterable[np.ndarray], span: Iterable[np.ndarray], most: float
+) -> Iterator[str]:
+    """Yield a line for each channel of which rare values stretch the range that a normaliser maps to [-1, 1].
+
+    Args:
+        field: that the channels belong to.
+        names: of the channels.
+        inner: least and greatest of nearly all values, (C,) each.
+        span: least and greatest of all values, (C,) each.
+        most: how many times the first range the second one may be.
+    """
+    for name, low, high, least, greatest in zip(names, *inner, *span, strict=True):
+        if high - low > 1e-4 and greatest - least > most * (high - low):
+            share = 100 * (high - low) / (greatest - least)
             yield (
-                f"{name} of {field} spans {low[k]:.4g} to {high[k]:.4g}, 99 % of it {inner_low[k]:.4g} to "
-                f"{inner_high[k]:.4g}: likely stray values, which leave the rest "
-                f"{100 * inner / (high[k] - low[k]):.2g} % of a normaliser's range"
+                f"{name} of {field} spans {least:.4g} to {greatest:.4g}, nearly all of it {low:.4g} to {high:.4g}: "
+                f"likely stray values, which leave the rest {share:.2g} % of a normaliser's range"
             )
 
 

@@ -119,7 +119,7 @@ def remark_missing(names: Sequence[str]) -> list[str]:
     """Return what to say of missing files in a store that may have left them out, in no or one line."""
     if not names:
         return []
-    return [f"{say_missing(names)}; zarr reads them as zeros, which is right only where the data is zero throughout"]
+    return [f"{say_missing(names)}; zarr fills in zeros, which is right only where all the data was zero"]
 
 
 def one_line(error: BaseException) -> str:

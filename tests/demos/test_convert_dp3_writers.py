@@ -162,7 +162,7 @@ BLENDED[BLENDED > 255] = 255
     ("rgb", "divisor", "said"),
     [
         (UNIT, 1, "are read as 0 to 1"),
-        (ONE_OVER, 1, "0.2.* to 1 are read as 0 to 1"),
+        (ONE_OVER, 1, "are read as 0 to 1, what is above 1, up to 1.000001, cut to 1"),
         (BYTES, 255, r"of [01] to 255 are read as 0 to 255: divided by 255"),
         (DARK_EPISODE, 255, "divided by 255"),
         (BLENDED, 255, "divided by 255"),
@@ -217,7 +217,9 @@ def test_actions_in_radians(tmp_path):
     joints = contents()["data/action"] * np.float32(2.8)
     joints[0] = 2.8
     source = write_dp3(tmp_path / "a.zarr", {"data/action": joints})
-    with pytest.raises(SpecMismatchError, match=r"reaches 2.8 where .*\[-1, 1\]: --action-scale 2.81 divides all"):
+    with pytest.raises(
+        SpecMismatchError, match=r"reaches 2.8 where .*\[-1, 1\]: give --action-scale 2.81, or 3 numbers"
+    ):
         import_store(source, "dp3", tmp_path / "no.zarr")
     with pytest.raises(SpecMismatchError, match=r"divided by --action-scale, an action still reaches 1.4 "):
         import_store(source, "dp3", tmp_path / "no.zarr", action_scale=(2.0,))

@@ -29,7 +29,7 @@ def test_a_stream_that_is_cut_short_is_no_end(missing):
 
 def test_a_failure_is_told_in_its_last_line(tmp_path):
     with (
-        pytest.raises(ManicmError, match=r"KeyError: 'unknown'"),
+        pytest.raises(ManicmError, match=r"KeyError: 'unknown'\): try another --out, or report this$"),
         Writer("unknown", sys.executable, tmp_path / "a", {}),
     ):
         pass
@@ -47,3 +47,14 @@ def test_an_error_in_the_block_stops_the_process(tmp_path):
     with pytest.raises(ZeroDivisionError), Writer("minari", sys.executable, tmp_path / "a", {}) as writer:
         _ = 1 / 0
     assert writer._process.returncode is not None
+
+
+def test_only_a_failed_import_is_blamed_on_the_installation(tmp_path):
+    script = tmp_path / "python"
+    script.write_text('#!/bin/sh\ncat > /dev/null\necho "ImportError: no minari here" >&2\nexit 1\n')
+    script.chmod(0o755)
+    with (
+        pytest.raises(ManicmError, match=r"\(ImportError: no minari here\): check that library's installation$"),
+        Writer("minari", str(script), tmp_path / "a", {}),
+    ):
+        pass

@@ -142,7 +142,7 @@ def test_a_missing_file_of_a_store_that_may_have_left_it_out_is_a_remark(sound, 
     (path / "data/action/1.0").unlink()
     (path / "data/state/0.0").unlink()
     [said] = remarks(path, capsys)
-    assert said.startswith("2 chunk files are missing: data/state/0.0, data/action/1.0; zarr reads them as zeros")
+    assert said.startswith("2 chunk files are missing: data/state/0.0, data/action/1.0; zarr fills in zeros")
     with DemoStore.open(path) as store:
         assert store.missing_files == ("data/state/0.0", "data/action/1.0")
 

@@ -13,6 +13,7 @@ from manicm_ms.types import ChunkSpec
 
 RNG = np.random.default_rng(0)
 CLOUDS = RNG.uniform(-0.5, 0.5, (30, 16, 6)) + np.array([0, 0, 0, 0.5, 0.5, 0.5])
+MANY = RNG.uniform(-0.5, 0.5, (60, 100, 3))
 STATE = RNG.uniform(-1, 1, (300, 4))
 ACTIONS = RNG.uniform(-1, 1, (30, 2))
 
@@ -30,6 +31,11 @@ def changed(values, where, value):
         ("point_cloud", CLOUDS[..., :3], []),
         ("point_cloud", 1000 * CLOUDS[..., :3], ["point_cloud reaches 499", "likely millimetres"]),
         ("point_cloud", changed(CLOUDS, (3, 4, 2), -65.5), ["reaches 65.5 m, 0.208 % of it beyond 10 m: likely stray"]),
+        (
+            "point_cloud",
+            changed(MANY, (3, 4, 2), 9),
+            ["z (m) of point_cloud spans -0.4997 to 9, nearly all of it", "11 %"],
+        ),
         ("point_cloud", changed(CLOUDS, (3, 4, 2), np.nan), []),  # a problem of the store, which inspect names
         ("point_cloud", CLOUDS[..., :3] / 1000, ["spans 1 mm in all: its unit is likely not the metre"]),
         ("point_cloud", CLOUDS * [1, 1, 1, 255, 255, 255], ["colours of point_cloud span 0", "likely bytes, 0 to 255"]),
@@ -40,7 +46,11 @@ def changed(values, where, value):
             ["z (m) and 1 more entry of agent_pos reaches 4", "likely millimetres"],
         ),
         ("agent_pos", changed(STATE, (7, 3), 9.0) * [1, 1, 1, 0.01], []),
-        ("agent_pos", changed(STATE * [1, 1, 1, 0.01], (7, 3), 9.0), ["gripper (m) of agent_pos spans", "99 % of it"]),
+        (
+            "agent_pos",
+            changed(STATE * [1, 1, 1, 0.01], (7, 3), 9.0),
+            ["gripper (m) of agent_pos spans", "nearly all of it"],
+        ),
         ("action", ACTIONS, []),
         ("action", np.zeros((30, 2)), ["action never changes in 30 frames"]),
         ("depth", RNG.uniform(0, 9, (5, 6, 8)), []),

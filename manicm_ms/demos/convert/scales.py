@@ -150,7 +150,7 @@ def _color_scale(raw: RawStore, facts: _CloudFacts) -> float:
     if facts.rgb_high > 1 + COLOR_SLACK and (facts.rgb_whole or facts.rgb_above > _RARE * facts.rgb_values):
         raw.notes.append(f"{span} are read as 0 to 255: divided by 255")
         return _BYTE
-    over = f", {facts.rgb_above} values above 1 cut to 1" if facts.rgb_above else ""
+    over = f", what is above 1, up to {facts.rgb_high:.7g}, cut to 1" if facts.rgb_high > 1 else ""
     raw.notes.append(f"{span} are read as 0 to 1{over}")
     return 1.0
 
@@ -174,8 +174,8 @@ def _action_scale(raw: RawStore, given: Sequence[float]) -> np.ndarray:
         most = float(f"{1.005 * reach.max():.3g}")  # rounded up
         scaled = "divided by --action-scale, an action still" if given else "an action"
         raise SpecMismatchError(
-            f"{raw.path}: {scaled} reaches {worst:.3g} where actions are normalised to [-1, 1]: --action-scale "
-            f"{most:g} divides all entries by it, {dim} numbers each by its own; with --env they are its controller's"
+            f"{raw.path}: {scaled} reaches {worst:.3g} where actions are normalised to [-1, 1]: give "
+            f"--action-scale {most:g}, or {dim} numbers, to divide them; with --env, the scales of its controller"
         )
     if given:
         divisors = ", ".join(f"{s:g}" for s in given)
@@ -205,7 +205,7 @@ def _depth(raw: RawStore, given: float | None) -> float:
         if given is not None:
             raise ConfigError(f"{raw.path} holds no depth that can be kept: drop --depth-scale")
         return 1.0
-    kind, keep = raw.arrays["depth"].dtype, "--depth-scale with the metres of a unit, as 0.001, keeps it"
+    kind, keep = raw.arrays["depth"].dtype, "--depth-scale 0.001 keeps it as millimetres"
     if kind.kind != "f" and given is None:
         raw.leave_out("depth", f"{kind}, a camera's units: {keep}")
         return 1.0
@@ -228,5 +228,6 @@ def _require_finite(raw: RawStore, name: str, start: int, block: np.ndarray) -> 
     if not finite.all():
         first = start + int(np.flatnonzero(~finite)[0])
         raise StoreError(
-            f"{raw.path}: {name} holds NaN or infinity, first in {raw.place(first)}: mend or leave out that episode"
+            f"{raw.path}: {name} holds NaN or infinity, first in {raw.place(first)}: mend or leave out that "
+            f"episode{raw.say_missing()}"
         )
