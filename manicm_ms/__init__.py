@@ -1,11 +1,14 @@
 """manicm_ms: one-step 3D manipulation policies and the parallel simulation to judge them in.
 
-Importing this package loads no simulator; `make_vec` does, on first use.
+Importing this package makes its ids known to Gymnasium (`gymnasium.make("UR3eStackCube-v1")`) and loads no simulator;
+making an environment does.
 """
 
 from __future__ import annotations
 
 from typing import TYPE_CHECKING, Any
+
+from manicm_ms import gym_ids
 
 __version__ = "0.1.0"
 __all__ = ["__version__", "check_vec_env", "make_vec"]
@@ -23,3 +26,6 @@ def __getattr__(name: str) -> Any:
     import importlib
 
     return getattr(importlib.import_module(_LAZY[name]), name)
+
+
+gym_ids.register()

@@ -9,13 +9,12 @@ from typing import ClassVar
 import numpy as np
 import sapien
 import torch
-from mani_skill.utils.registration import register_env
 from mani_skill.utils.structs import Actor, Pose
 from torch import Tensor
 
 from manicm_ms.demos.experts import EXPERTS
 from manicm_ms.demos.waypoints import Motion, Waypoint, WaypointExpert, over, smallest_turn
-from manicm_ms.envs.maniskill import ManiSkillSimulator
+from manicm_ms.envs.maniskill import ManiSkillSimulator, register_env
 from manicm_ms.envs.simulator import ENVS, EnvEntry
 from manicm_ms.envs.ur3e_tabletop import (
     FINGERS_ALONG_Y,

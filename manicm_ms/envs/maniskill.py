@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from functools import partial
 from typing import Any
 
@@ -11,12 +11,13 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from manicm_ms import sapien_gpu, vulkan
+from manicm_ms import gym_ids, sapien_gpu, vulkan
 
 vulkan.prepare()  # before SAPIEN is first imported
 
 import mani_skill.envs  # noqa: E402, F401  (registers ManiSkill's own ids)
-from mani_skill.utils.registration import REGISTERED_ENVS  # noqa: E402
+from mani_skill.envs.sapien_env import BaseEnv  # noqa: E402
+from mani_skill.utils import registration  # noqa: E402
 
 from manicm_ms.camera_model import CameraModel, default_camera  # noqa: E402
 from manicm_ms.envs.cameras import CLOUD_POSITION, COLOR, cloud_shader, set_cloud_formats  # noqa: E402
@@ -193,6 +194,25 @@ def _make(
     return env.unwrapped  # type: ignore[return-value]
 
 
+def register_env(gym_id: str, max_episode_steps: int) -> Callable[[type[BaseEnv]], type[BaseEnv]]:
+    """Return a decorator that registers a task's class with ManiSkill and with Gymnasium, as ManiSkill's own does.
+
+    ManiSkill's would register an id anew that `import manicm_ms` has made known, with a warning, and its entry points
+    are functions, which `gymnasium.spec(id).to_json()` refuses.
+
+    Args:
+        gym_id: for example "UR3eSlideBlock-v1".
+        max_episode_steps: control steps of an episode.
+    """
+
+    def decorate(cls: type[BaseEnv]) -> type[BaseEnv]:
+        registration.register(gym_id, cls, max_episode_steps)
+        gym_ids.register_maniskill(gym_id, f"{cls.__module__}:{cls.__qualname__}", max_episode_steps)
+        return cls
+
+    return decorate
+
+
 def gym_id(env_id: str) -> str:
     """Return the id that a task is registered under with ManiSkill, for example "UR3eSlideBlock-v1".
 
@@ -206,4 +226,4 @@ def gym_id(env_id: str) -> str:
 
 def workspace_of(env_id: str) -> Box:
     """Return the crop box of a task's clouds, robot-base frame, metres; raises as `gym_id`."""
-    return REGISTERED_ENVS[gym_id(env_id)].cls.workspace
+    return registration.REGISTERED_ENVS[gym_id(env_id)].cls.workspace

@@ -6,6 +6,7 @@ from abc import abstractmethod
 from collections.abc import Sequence
 from typing import Any, ClassVar
 
+import gymnasium
 import numpy as np
 import sapien
 import torch
@@ -114,6 +115,11 @@ class UR3eTabletopEnv(RestorableEnv):
     def __init__(
         self, *args: Any, robot_uids: str = "ur3e_ag95", camera_model: CameraModel | None = None, **kwargs: Any
     ) -> None:
+        if robot_uids not in self.SUPPORTED_ROBOTS:
+            robots = " or ".join(map(repr, self.SUPPORTED_ROBOTS))
+            raise ConfigError(
+                f"{type(self).__name__} has the robot {robots}, got robot_uids={robot_uids!r}: leave robot_uids out"
+            )
         self.camera_model = camera_model
         self.objects: dict[str, Actor] = {}
         self.half_sizes: dict[str, Tensor] = {}
@@ -286,6 +292,12 @@ class UR3eTabletopEnv(RestorableEnv):
                 )
 
     # ---- episode ----------------------------------------------------------------------------------------------
+
+    def reset(self, seed: Any = None, options: dict[str, Any] | None = None) -> Any:
+        """Start new episodes: see ManiSkill's `BaseEnv.reset`."""
+        if seed is not None:  # nothing here draws from Gymnasium's generator, but its checker asks for it
+            gymnasium.Env.reset(self, seed=int(torch.as_tensor(seed).flatten()[0]))
+        return super().reset(seed=seed, options=options)
 
     @abstractmethod
     def _place_objects(self, rng: np.random.RandomState, count: int) -> None:
