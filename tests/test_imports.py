@@ -14,7 +14,7 @@ FOLDERS = {"manicm_ms": REPO / "manicm_ms", "manicm_ms.tasks": REPO / "tasks", "
 SIMULATORS = {"sapien", "mani_skill", "mujoco", "metaworld", "mplib"}
 BASE = {
     "types", "errors", "registry", "paths", "point_cloud", "provenance", "devices", "seeds", "camera_model",
-    "stereo_depth", "realism", "private_libraries", "progress", "camera_doubts",
+    "stereo_depth", "realism", "private_libraries", "wording", "progress", "camera_doubts",
     "written_numbers", "signals",
 }  # fmt: skip
 

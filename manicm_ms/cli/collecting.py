@@ -16,6 +16,7 @@ from manicm_ms.envs.simulator import ENVS
 from manicm_ms.errors import ConfigError, ManicmError, UnknownNameError
 from manicm_ms.paths import is_disk_full
 from manicm_ms.progress import progress_bars
+from manicm_ms.wording import counted
 
 DATA = Path("data")
 
@@ -23,7 +24,8 @@ DATA = Path("data")
 def collect_one(env_id: str, out: Path | None, episodes: int, options: Mapping[str, Any]) -> Collected:
     """Collect in one environment and say what came of it; `out` None takes its place under data."""
     done = collect(env_id, episodes, out or store_path(DATA, env_id), **options)
-    print(f"{done.path}: {done.episodes} episodes from {done.attempts} attempts, {done.added} of them new")
+    came = f"{counted(done.episodes, 'episode')} from {counted(done.attempts, 'attempt')}"
+    print(f"{done.path}: {came}, {done.added} new")
     return done
 
 

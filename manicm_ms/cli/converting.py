@@ -8,6 +8,7 @@ from typing import Any
 
 from manicm_ms.demos.convert import EXPORTERS, IMPORTERS, convert, import_store
 from manicm_ms.errors import ConfigError
+from manicm_ms.wording import counted
 
 
 def convert_or_import(
@@ -39,10 +40,6 @@ def convert_or_import(
 
         options = {name: value for name, value in reading.items() if value is not None}
         done = import_store(store, str(source), out, command=this_command(), **options)
-    print(f"{done.path}: {_count(done.episodes, 'episode')}, {_count(done.frames, 'frame')}")
+    print(f"{done.path}: {counted(done.episodes, 'episode')}, {counted(done.frames, 'frame')}")
     for note in done.notes:
         print(f"  {note}")
-
-
-def _count(number: int, what: str) -> str:
-    return f"{number} {what}{'' if number == 1 else 's'}"

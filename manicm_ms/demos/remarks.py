@@ -15,6 +15,7 @@ from manicm_ms.demos.store import OPTIONAL_FIELDS, STORE_ARRAYS, DemoStore
 from manicm_ms.demos.windows import Windows, window_index
 from manicm_ms.demos.zarr_files import array_names, remark_missing
 from manicm_ms.types import ChunkSpec, EnvSpec
+from manicm_ms.wording import counted
 
 MOST_METRES = 10.0
 """Farther than this from its frame's origin no workspace, and no camera of one, has a point."""
@@ -65,7 +66,7 @@ def length_remarks(lengths: np.ndarray, spec: EnvSpec) -> list[str]:
     if not longer.any():
         return []
     return [
-        f"{_count(longer.sum(), 'episode')} of {len(lengths)} last up to {lengths.max()} steps, {spec.env_id} ends at "
+        f"{counted(longer.sum(), 'episode')} of {len(lengths)} last up to {lengths.max()} steps, {spec.env_id} ends at "
         f"{spec.max_episode_steps}: likely another control rate than its {spec.action.control_hz:g} Hz"
     ]
 
@@ -95,13 +96,13 @@ def window_remarks(lengths: np.ndarray, chunk: ChunkSpec) -> list[str]:
     if unused := int((windows == 0).sum()):
         needed = chunk.horizon - (chunk.n_obs_steps - 1) - (chunk.n_action_steps - 1)
         remarks.append(
-            f"not learnt from: {_count(unused, 'episode')} of {len(lengths)}, {int(lengths[windows == 0].sum())} frames"
+            f"not learnt from: {counted(unused, 'episode')} of {len(lengths)}, {lengths[windows == 0].sum()} frames"
             f", shorter than the {needed} frames that a horizon of {chunk.horizon} needs here"
         )
     unseen = chunk.horizon - chunk.n_obs_steps - (chunk.n_action_steps - 1)
     if unseen > 0 and unused < len(lengths):
         remarks.append(
-            f"no decision is learnt at the last {_count(unseen, 'frame')} of each episode: a horizon of "
+            f"no decision is learnt at the last {counted(unseen, 'frame')} of each episode: a horizon of "
             f"{chunk.horizon} with {chunk.n_action_steps} actions executed reaches no later"
         )
     return remarks
@@ -117,9 +118,9 @@ def training_remarks(store: DemoStore, windows: Windows) -> list[str]:
     read = {name: getattr(windows, name).numpy() for name in ("point_cloud", "agent_pos", "action")}
     remarks = [*store_remarks(store, read), *window_remarks(store.lengths, windows.chunk)]
     if empty := int(empty_clouds(read["point_cloud"]).sum()):
-        remarks.append(f"{_count(empty, 'frame')} of {len(windows.action)} with an empty cloud: 'inspect' names them")
+        remarks.append(f"{counted(empty, 'frame')} of {len(windows.action)} with an empty cloud: 'inspect' names them")
     if failed := int((~store.successes).sum()):
-        remarks.append(f"{_count(failed, 'episode')} of {len(store)} not solved, and learnt from all the same")
+        remarks.append(f"{counted(failed, 'episode')} of {len(store)} not solved, and learnt from all the same")
     if idle := [name for name in OPTIONAL_FIELDS if name in store.fields]:
         remarks.append(f"stored but not learnt from: {', '.join(idle)}")
     return remarks
@@ -221,7 +222,3 @@ def _unit(name: str) -> str:
     """Return what stands in brackets at the end of an entry's name, as "m" in "x [m]"."""
     found = re.search(r"[\[(]([^\[\]()]*)[\])]$", name)
     return found[1] if found else ""
-
-
-def _count(number: int, what: str) -> str:
-    return f"{number} {what}{'' if number == 1 else 's'}"

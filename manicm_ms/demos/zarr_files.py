@@ -18,6 +18,7 @@ from typing import Any
 import zarr
 
 from manicm_ms.errors import StoreError
+from manicm_ms.wording import counted
 
 EPISODE_ENDS = "meta/episode_ends"
 HEADERS = {2: ".zarray", 3: "zarr.json"}
@@ -112,7 +113,7 @@ def say_missing(names: Sequence[str]) -> str:
     """Return, for example, "3 chunk files are missing: data/img/0.0.0.0, data/img/1.0.0.0, data/img/2.0.0.0"."""
     shown = ", ".join(names[:_MOST_NAMED])
     rest = f" and {len(names) - _MOST_NAMED} more" if len(names) > _MOST_NAMED else ""
-    return f"{len(names)} chunk file{' is' if len(names) == 1 else 's are'} missing: {shown}{rest}"
+    return f"{counted(len(names), 'chunk file')} {'is' if len(names) == 1 else 'are'} missing: {shown}{rest}"
 
 
 def remark_missing(names: Sequence[str]) -> list[str]:

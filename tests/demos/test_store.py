@@ -309,6 +309,24 @@ def test_every_chunk_has_a_file_and_one_that_is_lost_is_missed(tmp_path):
     DemoStore.open(path).close()
 
 
+def test_a_store_of_earlier_versions_is_extended(tmp_path):
+    path = make_store(tmp_path / "a.zarr")
+    with DemoStore.open(path, "a") as store:
+        store.append(idle(0, 30))  # one chunk
+    attributes = json.loads((path / ".zattrs").read_text())
+    (path / ".zattrs").write_text(json.dumps({k: v for k, v in attributes.items() if k != "chunks"}))
+    left_out = ("data/action/0.0", "data/state/0.0", "meta/seed/0")
+    for name in left_out:
+        (path / name).unlink()
+    with DemoStore.open(path, "a") as store:
+        assert set(store.missing_files) == set(left_out)
+        store.append(episode(7))
+    with DemoStore.open(path) as store:
+        require_same(store.episode(0), idle(0, 30))
+        require_same(store.episode(1), episode(7))
+        assert set(store.missing_files) == {"data/action/0.0", "data/state/0.0"}
+
+
 @pytest.mark.filterwarnings("error")
 def test_zarr_finds_nothing_strange_in_a_store(tmp_path):
     path = make_store(tmp_path / "a.zarr", SEEDS[:1])
