@@ -30,6 +30,7 @@ PINHOLE = "pinhole"
 _ROTATION_TOLERANCE = 1e-4  # a rotation written with five digits passes
 _DEPTH_UNITS = (1e-5, 1e-2)  # m: ten micrometres to a centimetre
 _NEAREST, _FARTHEST = 0.1, 20.0  # m: readings that are all outside say that the unit is wrong
+_GRID = 9  # points along each side of a box
 MAX_RAW = 65535  # largest value of a uint16
 
 
@@ -112,6 +113,16 @@ class CameraModel:
         """Return plain JSON values, to be recorded and compared."""
         return json.loads(json.dumps(asdict(self)))
 
+    def share_seen(self, box: Box) -> float:
+        """Return the share of a box of the robot-base frame that lies before the crop, as a grid of points has it."""
+        grid = np.stack(np.meshgrid(*np.linspace(box.low, box.high, _GRID).T), axis=-1).reshape(-1, 3)
+        x, y, z = ((grid - self.pose[:3, 3]) @ self.pose[:3, :3]).T
+        before = z > 0
+        u = self.fx * x[before] / z[before] + self.cx - self.crop.left
+        v = self.fy * y[before] / z[before] + self.cy - self.crop.top
+        inside_crop = (u >= -0.5) & (u < self.crop.width - 0.5) & (v >= -0.5) & (v < self.crop.height - 0.5)
+        return float(inside_crop.sum() / len(grid))
+
     def metres(self, raw: Tensor) -> Tensor:
         """Return the depth in metres, float32, of raw readings in units: one rounding for all who convert."""
         return raw.to(torch.float32) * self.depth_unit
@@ -120,6 +131,16 @@ class CameraModel:
         """Return the used part (..., h, w) of native images (..., height, width)."""
         left, top, width, height = self.crop
         return image[..., top : top + height, left : left + width]
+
+
+def require_view(camera: CameraModel, box: Box, env_id: str) -> None:
+    """Raise CameraError where the camera sees nothing of an environment's workspace: every cloud would be empty."""
+    if camera.share_seen(box) == 0:
+        at = ", ".join(f"{x:.2f}" for x in camera.pose[:3, 3])
+        raise CameraError(
+            f"the camera at ({at}) m sees nothing of the workspace of {env_id}, {box.low} to {box.high} m: is its "
+            "T_base_camera in the robot-base frame, in metres, with z along the optical axis?"
+        )
 
 
 def is_rigid(T: Any) -> bool:

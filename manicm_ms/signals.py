@@ -210,5 +210,11 @@ def _answered() -> list[int]:
 
 
 def _end_at_once(number: int, frame: FrameType | None) -> None:
-    os.write(2, b"stopped\n")
+    if not _is_child():  # one whose parent ends it, after an error say, has nothing to announce
+        os.write(2, b"stopped\n")
     os._exit(128 + number)
+
+
+def _is_child() -> bool:
+    processes = sys.modules.get("multiprocessing.process")
+    return processes is not None and processes.parent_process() is not None

@@ -20,6 +20,7 @@ from manicm_ms.camera_model import (
     nearest_pixels,
     read_camera,
     read_depth,
+    require_view,
     write_camera,
     write_depth,
 )
@@ -261,6 +262,30 @@ def test_doubts_are_warnings_that_name_the_file(tmp_path):
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         default_camera()
+
+
+def moved(shift):
+    pose = CAMERA.pose
+    pose[:3, 3] += shift
+    return replace(CAMERA, T_base_camera=tuple(map(tuple, pose.tolist())))
+
+
+def test_the_share_of_the_workspace_that_is_seen():
+    assert 0.8 < CAMERA.share_seen(WORKSPACE) < 0.9, "two upper corners are cut off"
+    assert CAMERA.share_seen(Box((1.0, -0.2, 0.0), (1.2, 0.2, 0.1))) == 0, "behind the camera"
+    point = (CAMERA.pose @ [*(rays()[150, 0] * 0.6), 1])[:3]  # on the left edge of the crop
+    assert CAMERA.share_seen(Box(tuple(point), tuple(point))) == 1
+    outside = (CAMERA.pose @ [*((rays()[150, 0] - [0.01, 0, 0]) * 0.6), 1])[:3]
+    assert CAMERA.share_seen(Box(tuple(outside), tuple(outside))) == 0
+    assert 0.1 < moved([0, 0.25, 0]).share_seen(WORKSPACE) < 0.7
+
+
+def test_a_camera_that_sees_nothing_is_refused():
+    require_view(CAMERA, WORKSPACE, "ur3e/slide-block")
+    with pytest.raises(
+        CameraError, match=r"camera at \(3\.71, 0\.28, 0\.43\) m sees nothing of the workspace of ur3e/x"
+    ):
+        require_view(moved([3.0, 0, 0]), WORKSPACE, "ur3e/x")
 
 
 SKEWED = [[1, 0.1, 0, 0], [0, 1, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]]

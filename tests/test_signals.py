@@ -173,3 +173,31 @@ def test_importing_the_command_line_leaves_signals_alone_but_in_the_command():
         code = f"import sys; sys.argv[0] = '/usr/bin/{name}'; {look}"
         done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
         assert done.stdout.strip() == handler
+
+
+PARENT = """
+import multiprocessing, sys, time
+sys.argv = ["manicm-ms"]
+from manicm_ms import signals
+signals.quiet_start(("manicm-ms",))
+def work(begun):
+    begun.set()
+    time.sleep(60)
+if __name__ == "__main__":
+    context = multiprocessing.get_context("spawn")
+    begun = context.Event()
+    worker = context.Process(target=work, args=(begun,))
+    worker.start()
+    begun.wait()
+    worker.terminate()
+    worker.join()
+    print(worker.exitcode)
+"""
+
+
+def test_a_worker_that_its_parent_ends_says_nothing(tmp_path):
+    script = tmp_path / "manicm-ms.py"
+    script.write_text(PARENT)
+    done = subprocess.run([sys.executable, script], capture_output=True, text=True, check=True, timeout=60)
+    assert int(done.stdout) != 0
+    assert done.stderr == ""

@@ -19,7 +19,7 @@ import mani_skill.envs  # noqa: E402, F401  (registers ManiSkill's own ids)
 from mani_skill.envs.sapien_env import BaseEnv  # noqa: E402
 from mani_skill.utils import registration  # noqa: E402
 
-from manicm_ms.camera_model import CameraModel, default_camera  # noqa: E402
+from manicm_ms.camera_model import CameraModel, default_camera, require_view  # noqa: E402
 from manicm_ms.envs.cameras import CLOUD_POSITION, COLOR, cloud_shader, set_cloud_formats  # noqa: E402
 from manicm_ms.envs.delay import ActionDelay  # noqa: E402
 from manicm_ms.envs.simulator import ENVS, Simulator, SimulatorConfig, StepResult  # noqa: E402
@@ -47,11 +47,14 @@ class ManiSkillSimulator(Simulator):
 
     Raises:
         RenderDeviceError: SAPIEN finds no Vulkan device.
+        CameraError: the configured camera sees nothing of the workspace.
     """
 
     def __init__(self, spec: EnvSpec, config: SimulatorConfig, gym_id: str) -> None:
         self.spec, self.config, self.num_rows = spec, config, config.num_rows
         self._entry = ENVS.get_registered(spec.env_id)
+        if config.camera is not None:
+            require_view(config.camera, workspace_of(spec.env_id), spec.env_id)
         camera = config.camera or (None if config.realism.is_clean else default_camera())
         size = config.image_size if camera is None else (camera.crop.height, camera.crop.width)
         self.env = _make(gym_id, spec, config, camera, size)

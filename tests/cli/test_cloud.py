@@ -13,8 +13,9 @@ import yaml
 
 from manicm_ms.camera_model import default_camera, depth_to_cloud, read_camera, write_camera, write_depth
 from manicm_ms.cli import USER_ERROR, main
-from manicm_ms.envs.simulator import ENVS
+from manicm_ms.envs.simulator import ENVS, SimulatorConfig
 from manicm_ms.envs.vec_env import make_vec
+from manicm_ms.errors import CameraError
 from manicm_ms.paths import asset
 from manicm_ms.point_cloud import Box
 from manicm_ms.realism import REALISM, RealismRows, believed_poses, true_cameras
@@ -237,6 +238,16 @@ def test_the_simulators_cloud_comes_out_of_its_recorded_depth_to_the_bit(tmp_pat
     cloud = observed(POINT_CLOUD, (84, 84)).numpy()
     assert len(np.unique(cloud, axis=0)) > 200
     np.testing.assert_array_equal(np.load(out), cloud)
+
+
+def test_a_cell_is_not_simulated_with_a_camera_that_sees_nothing_of_it():
+    """Demonstrations with empty clouds, and policies that play them, would both be no success."""
+    pose = default_camera().pose
+    pose[0, 3] += 3.0
+    entry = ENVS.get(ENV_ID)
+    config = SimulatorConfig(camera=replace(default_camera(), T_base_camera=tuple(map(tuple, pose.tolist()))))
+    with pytest.raises(CameraError, match="sees nothing of the workspace of ur3e/slide-block"):
+        entry.build(config.specialise(entry.spec), config)
 
 
 # ---- the guide
