@@ -250,7 +250,7 @@ class JudgeJob(Job):
         with EpisodeLog(self.stem.parent / "episodes" / f"{title}-{weights}.jsonl") as log:
             missing = [s for s in seeds if s not in log]
             with torch_threads(1):
-                rollout(env, policy, missing, on_episode=log.append)
+                rollout(env, policy, missing, on_episode=log.append, to_the_end=self.plan.to_the_end)
             results = [log[s] for s in seeds]
         console.print(f"{self.name} {title}: {sum(e.success for e in results)} of {len(results)}", highlight=False)
         return results

@@ -6,12 +6,15 @@ import json
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from manicm_ms.benchmark.methods import Method, parse_methods
 from manicm_ms.errors import ConfigError
 from manicm_ms.seeds import require_seed
 from manicm_ms.training.presets import STUDENT_PRESETS, TEACHER_PRESETS, preset_identity
+
+if TYPE_CHECKING:
+    from manicm_ms.envs.simulator import EnvEntry
 
 EVALUATION_SEEDS_BEYOND = 1_000_000
 """The evaluations during training play seeds this far beyond the first fresh one."""
@@ -40,6 +43,7 @@ class Plan:
         evaluation_episodes: episodes of each.
         num_envs: environments that play at once in a job.
         device: torch device of trainings and policies.
+        to_the_end: play on after a success that is certain, so that success at the last step is known.
     """
 
     env_ids: tuple[str, ...]
@@ -58,6 +62,7 @@ class Plan:
     evaluation_episodes: int = 20
     num_envs: int = 2
     device: str = "cpu"
+    to_the_end: bool = False
 
     def __post_init__(self) -> None:
         if not self.env_ids or not self.seeds:
@@ -81,12 +86,25 @@ class Plan:
 
     def require_unseen(self, demonstrated: Sequence[int]) -> None:
         """Raise ConfigError where a seed that is to judge a policy is among those of its demonstrations."""
-        judging = {*self.fresh_seeds, *(s for k in range(self.evaluations) for s in self.evaluation_seeds(k))}
+        judging = {s for seeds in self._judging_seeds for s in seeds}
         if shared := judging & set(demonstrated):
             raise ConfigError(
                 f"seed {min(shared)} is that of a demonstration and would judge the policies as well: choose "
                 "--eval-seed and --demo-seed apart"
             )
+
+    def require_seeds_of(self, entry: EnvEntry) -> None:
+        """Raise ConfigError where a seed that is to be played lies beyond those that the environment takes."""
+        last = max(s for seeds in self._judging_seeds for s in (seeds[0], seeds[-1]))
+        if last >= entry.seed_limit:
+            raise ConfigError(
+                f"seeds of {entry.spec.env_id} end at {entry.seed_limit - 1}, and the fresh ones with those of the "
+                f"evaluations run to {last}: choose a smaller --eval-seed"
+            )
+
+    @property
+    def _judging_seeds(self) -> list[range]:
+        return [self.fresh_seeds, *(self.evaluation_seeds(k) for k in range(self.evaluations))]
 
     @property
     def parsed_methods(self) -> tuple[Method, ...]:
@@ -120,6 +138,7 @@ class Plan:
                  "evaluation_episodes", "device")  # fmt: skip
         return {
             **{name: getattr(self, name) for name in named},
+            **({"to_the_end": True} if self.to_the_end else {}),  # folders of earlier versions lack it
             "data": str(self.data.resolve()),
             "recipes": {name: preset_identity(recipe) for name, recipe in recipes.items()},
         }

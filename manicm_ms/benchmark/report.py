@@ -174,10 +174,11 @@ def paired_lines(results: Mapping[str, Any]) -> list[str]:
             lines.append(f"{pair['second']} minus {pair['first']}: no training is done on all tasks yet. {tests}")
             continue
         low, high = (100 * bound for bound in pair["ci95"])
+        tasks = f"{pair['tasks']} task{'' if pair['tasks'] == 1 else 's'}"
         each = ", ".join(f"{100 * d:+.1f}" for d in pair["by_seed"].values())
         by_training = f"by training {each}; " if len(pair["by_seed"]) > 1 else ""
         lines.append(
-            f"{pair['second']} minus {pair['first']}, mean of {pair['tasks']} tasks on the same {pair['start_states']} "
+            f"{pair['second']} minus {pair['first']}, mean of {tasks} on the same {pair['start_states']} "
             f"start states: {100 * pair['difference']:+.1f} points ({by_training}95 % interval {low:+.1f} to "
             f"{high:+.1f}, of {pair['speaks_of']}). {tests}"
         )

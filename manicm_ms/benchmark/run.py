@@ -50,7 +50,9 @@ def benchmark(
     if processes < 1:
         raise ConfigError(f"--processes must be at least 1, got {processes}")
     for env_id in plan.env_ids:
-        ENVS.get(env_id).require(SimulatorConfig(obs_preset=plan.obs_preset))
+        entry = ENVS.get(env_id)
+        entry.require(SimulatorConfig(obs_preset=plan.obs_preset))
+        plan.require_seeds_of(entry)
         EXPERTS.get(env_id)
     _claim(plan)
     jobs = all_jobs(plan)

@@ -65,7 +65,7 @@ def compile_table(plan: Plan, command: str) -> dict[str, Any]:
         **summarise(cells, plan.env_ids, plan.parsed_methods),
         "intervals": INTERVALS,
         "demonstrations": [_demonstrations(plan, env_id) for env_id in plan.env_ids],
-        "missing": [_missing(job) for job in _judge_jobs(plan) if not job.is_done()],
+        "missing": [_missing(job) for job in _judge_jobs(plan) if not _is_measured(job)],
     }
 
 
@@ -73,8 +73,19 @@ def _judge_jobs(plan: Plan) -> Iterable[JudgeJob]:
     return (JudgeJob(plan, e, s, m) for e in plan.env_ids for s in plan.seeds for m in plan.parsed_methods)
 
 
+def _is_measured(job: JudgeJob) -> bool:
+    """Return whether it is done and any of its episodes was played to an end: crashes alone are no rate."""
+    return job.is_done() and any(episode["crashed"] is None for episode in job.result()["episodes"])
+
+
 def _missing(job: JudgeJob) -> dict[str, str]:
     reason = "not done yet"
+    if job.is_done():
+        first = job.result()["episodes"][0]
+        reason = (
+            f"every episode crashed, seed {first['seed']} with: {first['crashed']}; "
+            f"delete {job.stem.parent / 'episodes'} and {job.result_file} to play them again"
+        )
     for stage in (*_needs(job), job):
         if stage.failure_file.is_file() and not stage.is_done():
             reason = json.loads(stage.failure_file.read_text(encoding="utf-8"))["reason"]
@@ -87,7 +98,7 @@ def _needs(job: Any) -> list[Any]:
 
 def _cell(plan: Plan, env_id: str, method: Method) -> dict[str, Any]:
     """Return the results of one method on one task, over the training seeds that are done."""
-    jobs = [job for seed in plan.seeds if (job := JudgeJob(plan, env_id, seed, method)).is_done()]
+    jobs = [job for seed in plan.seeds if _is_measured(job := JudgeJob(plan, env_id, seed, method))]
     results = [job.result() for job in jobs]
     seeds = [str(job.seed) for job in jobs]
     outcomes, once, at_end = (_outcomes(results, seeds, key) for key in ("success", "success_once", "success_at_end"))

@@ -273,6 +273,7 @@ def benchmark_command(
     num_envs: Count = 2,
     device: str = "auto",
     ray: str | None = None,
+    to_the_end: bool = False,
 ) -> int:
     """Run the grid task x method x seed and write the paper's main table; any number of these may run at once.
 
@@ -298,6 +299,7 @@ def benchmark_command(
         num_envs: environments that play at once in each.
         device: torch device of trainings and policies; auto takes an accelerator where there is one.
         ray: address of a Ray cluster to work on instead ("auto", "local"); needs the extra ray and shared folders.
+        to_the_end: play on after a success that is certain, so that success at the last step is known too.
     """
     from manicm_ms.benchmark.plan import Plan, parse_envs, parse_seeds, split_names
     from manicm_ms.benchmark.run import benchmark
@@ -308,7 +310,7 @@ def benchmark_command(
         env_ids=parse_envs(envs), methods=tuple(split_names(methods)), seeds=parse_seeds(seeds), preset=preset, out=out,
         data=data or out / "data", demos=demos, demo_seed=demo_seed, colors=colors, obs_preset=obs_preset,
         episodes=episodes, eval_seed=eval_seed, evaluations=evaluations, evaluation_episodes=evaluation_episodes,
-        num_envs=num_envs, device=str(resolve_device(device)),
+        num_envs=num_envs, device=str(resolve_device(device)), to_the_end=to_the_end,
     )  # fmt: skip
     results = benchmark(plan, processes=processes or default_num_envs(), ray=ray, command=this_command())
     return 1 if results["missing"] else 0

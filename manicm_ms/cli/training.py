@@ -61,6 +61,7 @@ def distill_command(arguments: Sequence[str]) -> Callable[..., None]:
         preset: str = DEFAULT_PRESET,
         device: str = "auto",
         seed: Seed = 0,
+        allow_other_task: bool = False,
     ) -> None:
         """Distil a teacher into a one-step ManiCM student; the same command goes on after Ctrl-C or a kill.
 
@@ -72,10 +73,14 @@ def distill_command(arguments: Sequence[str]) -> Callable[..., None]:
             preset: recipe to start from; `manicm-ms list presets` shows them.
             device: torch device; auto takes an accelerator where there is one.
             seed: of batches and noise.
+            allow_other_task: take demonstrations of another task than the teacher's, which is refused otherwise.
         """
         from manicm_ms.training.student import distill as distill_student
 
-        distill_student(teacher, data, out, recipe, device=device, seed=seed, command=this_command())
+        distill_student(
+            teacher, data, out, recipe, device=device, seed=seed, allow_other_task=allow_other_task,
+            command=this_command(),
+        )  # fmt: skip
 
     return distill
 

@@ -7,7 +7,7 @@ from pathlib import Path
 from rich.console import Console
 
 from manicm_ms.devices import torch_threads
-from manicm_ms.errors import CheckpointError, ConfigError
+from manicm_ms.errors import CheckpointError, ConfigError, SpecMismatchError
 from manicm_ms.policies.checkpoint import load_checkpoint, read_manifest
 from manicm_ms.policies.diffusion import DiffusionPolicy
 from manicm_ms.policies.manicm import ManiCM
@@ -18,7 +18,7 @@ from manicm_ms.training.loop import Batches
 from manicm_ms.training.objectives import DISTILLATIONS, PolicyObjective
 from manicm_ms.training.presets import StudentPreset
 from manicm_ms.training.session import Session, read_demos
-from manicm_ms.types import require_compatible
+from manicm_ms.types import EnvSpec, require_compatible
 
 
 def distill(
@@ -34,6 +34,7 @@ def distill(
     console: Console | None = None,
     command: str | None = None,
     snapshots: int = 0,
+    allow_other_task: bool = False,
 ) -> Path:
     """Distil a teacher and write the student's checkpoint; the same call goes on after a kill.
 
@@ -51,13 +52,14 @@ def distill(
         console: for progress; standard error by default.
         command: the command line, for the record; this process's by default.
         snapshots: checkpoints to keep on the way, at even distances; see `snapshot_folders`.
+        allow_other_task: distil on demonstrations of another task than the teacher's, which is refused otherwise.
 
     Returns:
         `out`.
 
     Raises:
         CheckpointError: the teacher is missing, damaged, or not a diffusion policy.
-        SpecMismatchError: data and teacher were made for different observations or actions.
+        SpecMismatchError: data and teacher were made for different observations or actions, or for different tasks.
         ManicmError: unfit configuration, damaged store, another run in `out`, full disk, NaN loss.
     """
     require_seed(seed)
@@ -67,6 +69,8 @@ def distill(
         raise CheckpointError(f"{teacher} holds a {policy.name}, which cannot be distilled: give a diffusion teacher")
     demos = read_demos(data, policy.chunk)
     require_compatible(demos.spec, policy.spec, f"the data {data}", f"the teacher {teacher}")
+    if not allow_other_task:
+        _require_same_task(demos.spec, data, policy.spec, teacher)
     student = ManiCM.from_teacher(policy, nfe=preset.nfe, num_solver_steps=_solver_steps(policy, preset.skip))
     manifest = read_manifest(teacher)
     session = Session.start(
@@ -93,6 +97,15 @@ def distill(
     inputs = {"teacher": weights, "data": demos.provenance["sha256"]}
     made_from = {"path": str(teacher), "sha256": weights, "provenance": manifest["provenance"]}
     return session.complete(inputs, {"data": demos.provenance, "teacher": made_from}, build, snapshots)
+
+
+def _require_same_task(demonstrated: EnvSpec, data: Path, learnt: EnvSpec, teacher: Path) -> None:
+    """Raise SpecMismatchError where the demonstrations are of another task than the one that the teacher learnt."""
+    if demonstrated.env_id != learnt.env_id:
+        raise SpecMismatchError(
+            f"the data {data} are of {demonstrated.env_id} and the teacher {teacher} was trained for {learnt.env_id}: "
+            "name its own demonstrations, or add --allow-other-task if you mean it"
+        )
 
 
 def _solver_steps(teacher: DiffusionPolicy, skip: int) -> int:

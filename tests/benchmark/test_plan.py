@@ -7,6 +7,7 @@ import pytest
 from manicm_ms.benchmark.jobs import all_jobs
 from manicm_ms.benchmark.methods import OneStep, Student, Teacher, parse_methods
 from manicm_ms.benchmark.plan import Plan, parse_envs, parse_seeds
+from manicm_ms.envs.simulator import ENVS
 from manicm_ms.errors import ConfigError, UnknownNameError
 
 
@@ -128,3 +129,19 @@ def test_no_demonstration_judges_a_policy():
     for seen in (100, 109, asked.evaluation_seeds(4)[-1]):
         with pytest.raises(ConfigError, match=f"seed {seen} is that of a demonstration"):
             asked.require_unseen([0, seen])
+
+
+def test_seeds_that_an_environment_does_not_take_are_refused_before_anything_is_played():
+    thirty_two, sixty_four = ENVS.get("ur3e/slide-block"), ENVS.get("metaworld/reach")
+    plan(eval_seed=2**32 - 50, episodes=50).require_seeds_of(thirty_two)
+    beyond = plan(eval_seed=2**32 - 50, episodes=51)
+    with pytest.raises(ConfigError, match=r"ur3e/slide-block end at 4294967295, .* run to 4294967296: .*--eval-seed"):
+        beyond.require_seeds_of(thirty_two)
+    beyond.require_seeds_of(sixty_four)
+    with pytest.raises(ConfigError, match="those of the evaluations run to"):
+        plan(eval_seed=2**32 - 50, episodes=50, evaluations=5).require_seeds_of(thirty_two)
+
+
+def test_playing_to_the_end_is_another_benchmark_and_earlier_folders_stay_readable():
+    assert "to_the_end" not in plan().identity
+    assert plan(to_the_end=True).identity["to_the_end"]

@@ -182,6 +182,18 @@ def test_the_page_of_results_is_what_the_kept_outcomes_give(name):
         assert all(note in page for note in interval_lines(found))
 
 
+def test_where_every_episode_crashed_there_is_no_rate_and_the_job_is_named(plan):
+    write_results(plan, "adroit/door", 0, "simple_dp3", 5)
+    job = JudgeJob(plan, "adroit/door", 1, plan.parsed_methods[0])
+    episodes = [{"seed": s, "success": False, "steps": 0, "crashed": "no device"} for s in plan.fresh_seeds]
+    job.stem.parent.mkdir(parents=True)
+    write_json(job.result_file, {"nfe": 10, "episodes": episodes, "evaluations": []})
+    results = compile_table(plan, "x")
+    assert row(results, "simple_dp3")["average"]["by_seed"] == {"0": 0.5}
+    (reason,) = [m["reason"] for m in results["missing"] if m["job"] == job.name]
+    assert "every episode crashed, seed 100000 with: no device" in reason
+
+
 def test_a_cell_that_is_not_done_is_named_and_left_out(plan):
     write_results(plan, "adroit/door", 0, "simple_dp3", 5)
     results = compile_table(plan, "x")

@@ -11,9 +11,9 @@ from manicm_ms.types import ActionSpec, EnvSpec, ObsSpec
 STEP = 0.05  # metres that an action of 1 moves the hand
 
 
-def reach_spec(num_points=64, action_names=("dx [m]", "dy [m]", "dz [m]")):
+def reach_spec(num_points=64, action_names=("dx [m]", "dy [m]", "dz [m]"), env_id="test/reach"):
     return EnvSpec(
-        env_id="test/reach",
+        env_id=env_id,
         obs=ObsSpec(num_points=num_points, point_channels=3, agent_pos_dim=4, frame="robot_base"),
         action=ActionSpec(names=action_names, control_mode="pd_ee_delta_pos", control_hz=20.0),
         max_episode_steps=50,

@@ -203,6 +203,15 @@ def test_devices_that_cannot_share_a_batch_are_refused_before_any_process_starts
     assert list(tmp_path.iterdir()) == []
 
 
+def test_a_teacher_is_distilled_on_its_own_tasks_data_unless_another_is_meant(pair, tmp_path):
+    other = make_store(tmp_path / "other.zarr", episodes=2, env_id="test/reach-far")
+    with pytest.raises(SpecMismatchError, match=r"are of test/reach-far and .* for test/reach: .*--allow-other-task"):
+        run(distill, pair[2], other, tmp_path / "s", STUDENT)
+    assert not (tmp_path / "s").exists()
+    student, _ = run(distill, pair[2], other, tmp_path / "s", replace(STUDENT, **FEW), allow_other_task=True)
+    assert read_manifest(student)["provenance"]["data"]["env_id"] == "test/reach-far"
+
+
 def test_epsilon_prediction_and_the_public_formula_train_too(pair, tmp_path):
     _, data, *_ = pair
     out, _ = run(
