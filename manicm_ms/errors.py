@@ -116,3 +116,7 @@ class TrainingDivergedError(ManicmError):
 
 class CalibrationError(ManicmError):
     """Images or robot poses from which no camera pose can be solved."""
+
+
+class TaskWarning(ManicmWarning):
+    """A task file of the user's that cannot be imported and is left out."""

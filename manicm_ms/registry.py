@@ -3,15 +3,23 @@
 from __future__ import annotations
 
 import importlib
+import importlib.util
 import os
 import pkgutil
+import traceback
+import warnings
 from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path
 from typing import Any, Generic, TypeVar
 
-from manicm_ms.errors import ConfigError, DuplicateNameError, UnknownNameError
+from manicm_ms.errors import ConfigError, DuplicateNameError, TaskWarning, UnknownNameError
 
 T = TypeVar("T")
+
+_entered: list[tuple[Registry[Any], str]] = []
+"""Registry and name of every entry, in order: what a module had entered before it failed is taken out again."""
+_left_out: set[str] = set()
+"""Modules that cannot be imported: several registries discover the same package, but one warning is enough."""
 
 
 class Registry(Generic[T]):
@@ -44,7 +52,12 @@ class Registry(Generic[T]):
         self._entries[name] = entry
         self._tags[name] = frozenset(tags)
         self._former.update(dict.fromkeys(former, name))
+        _entered.append((self, name))
         return entry
+
+    def _remove(self, name: str) -> None:
+        del self._entries[name], self._tags[name]
+        self._former = {former: present for former, present in self._former.items() if present != name}
 
     def register(self, name: str, tags: Iterable[str] = ()) -> Callable[[Any], Any]:
         """Return a decorator that enters what it decorates under `name`."""
@@ -80,7 +93,34 @@ class Registry(Generic[T]):
             return
         package, self._package = importlib.import_module(self._package), None
         for module in pkgutil.iter_modules(package.__path__):
-            importlib.import_module(f"{package.__name__}.{module.name}")
+            name = f"{package.__name__}.{module.name}"
+            if module.module_finder.path == package.__path__[0]:  # type: ignore[union-attr]
+                importlib.import_module(name)
+            elif name not in _left_out:
+                _import_or_leave_out(name)
+
+
+def _import_or_leave_out(name: str) -> None:
+    """Import a module from a folder of the user's; one that cannot be imported is named in one line and left out."""
+    before = len(_entered)
+    try:
+        importlib.import_module(name)
+    except (Exception, SystemExit) as error:  # whatever it is, it is that file's: the other tasks go on
+        for registry, entry in _entered[before:]:
+            registry._remove(entry)
+        del _entered[before:]
+        _left_out.add(name)
+        spec = importlib.util.find_spec(name)
+        file, line, what = _where(error, spec.origin if spec and spec.origin else name)
+        warnings.warn(f"{file}, line {line}: {what}; its tasks are left out", TaskWarning, stacklevel=2)
+
+
+def _where(error: BaseException, origin: str) -> tuple[str, int, str]:
+    """Return file, line and words of what stopped the import of the file `origin`."""
+    if isinstance(error, SyntaxError):
+        return error.filename or origin, error.lineno or 1, f"{type(error).__name__}: {error.msg}"
+    frames = [frame for frame in traceback.extract_tb(error.__traceback__) if frame.filename == origin]
+    return origin, (frames[-1].lineno if frames else None) or 1, f"{type(error).__name__}: {error}"
 
 
 def outside_folders(variable: str, beside: Sequence[str]) -> list[str]:

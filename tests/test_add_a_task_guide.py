@@ -49,6 +49,7 @@ def task_folder(tmp_path_factory):
     """A folder outside the repository that holds the task as the guide gives it."""
     folder = tmp_path_factory.mktemp("my_tasks")
     (folder / "push_cube.py").write_text("".join(blocks("python")), encoding="utf-8")
+    (folder / "half_done.py").write_text("import no_such_module\n", encoding="utf-8")  # its neighbours do not mind
     return folder
 
 
@@ -69,6 +70,7 @@ def test_a_task_outside_the_repository_goes_from_check_to_evaluation(task_folder
     )
     assert done.returncode == 0, done.stdout + done.stderr
     assert "ur3e/push-cube" in done.stdout
+    assert done.stderr.count("half_done.py, line 1: ModuleNotFoundError: No module named 'no_such_module'") == 1
     assert "3 episodes from 3 attempts" in " ".join(done.stdout.split()), done.stdout
     results = json.loads((tmp_path / "report" / "results.json").read_text())
     assert results["env_id"] == "ur3e/push-cube"

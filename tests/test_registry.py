@@ -1,8 +1,13 @@
 """Names are found, near misses suggested, duplicates refused."""
 
+import sys
+import warnings
+from types import ModuleType
+
 import pytest
 
-from manicm_ms.errors import DuplicateNameError, UnknownNameError
+from manicm_ms import registry as registry_module
+from manicm_ms.errors import DuplicateNameError, TaskWarning, UnknownNameError
 from manicm_ms.registry import Registry
 
 
@@ -29,3 +34,60 @@ def test_duplicates_are_refused(fruits):
     with pytest.raises(DuplicateNameError):
         fruits.add("apple", 3)
     assert fruits.get("apple") == 1
+
+
+# ---- files of the user's own ----------------------------------------------------------------------------------------
+
+GOOD = "from fruit_registry import FRUITS\nFRUITS.add({name!r}, 1)\n"
+BROKEN = {
+    "syntax": ("x = 1\ndef (:\n", 2, "SyntaxError: invalid syntax"),
+    "missing": (
+        GOOD.format(name="half") + "\nimport no_such_module\n",
+        4,
+        "ModuleNotFoundError: No module named 'no_s",
+    ),
+    "raises": ("def f():\n    return {}['key']\nf()\n", 2, "KeyError: 'key'"),
+    "leaves": ("import sys\nsys.exit(3)\n", 2, "SystemExit: 3"),
+    "taken": (GOOD.format(name="shipped"), 2, "DuplicateNameError: fruit 'shipped' is registered twice"),
+}
+
+
+@pytest.fixture
+def package(tmp_path, monkeypatch):
+    """A package with one module of its own, and a folder of the user's beside it; returns registry and that folder."""
+    own, users = tmp_path / "fruits_of_a_test", tmp_path / "users"
+    own.mkdir()
+    users.mkdir()
+    (own / "__init__.py").write_text(f"__path__.append({str(users)!r})\n")
+    (own / "shipped.py").write_text(GOOD.format(name="shipped"))
+    monkeypatch.syspath_prepend(str(tmp_path))
+    holder = ModuleType("fruit_registry")
+    holder.FRUITS = Registry("fruit", package=own.name)
+    monkeypatch.setitem(sys.modules, holder.__name__, holder)
+    yield holder.FRUITS, users, own
+    for name in [name for name in sys.modules if name.startswith(own.name)]:
+        del sys.modules[name]
+    registry_module._left_out.clear()
+
+
+@pytest.mark.parametrize("kind", BROKEN)
+def test_a_broken_file_is_named_with_its_line_and_the_others_go_on(package, kind):
+    fruits, users, own = package
+    text, line, what = BROKEN[kind]
+    (users / f"{kind}.py").write_text(text)
+    (users / "zest.py").write_text(GOOD.format(name="zest"))
+    with pytest.warns(TaskWarning) as told:
+        assert fruits.names() == ("shipped", "zest"), "and nothing of what the broken file had entered"
+    (warning,) = told
+    assert str(warning.message).startswith(f"{users / kind}.py, line {line}: {what}")
+    assert "\n" not in str(warning.message)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")  # said once, though experts are discovered after environments
+        assert Registry("skin", package=own.name).names() == ()
+
+
+def test_a_broken_file_of_the_package_itself_is_a_defect(package):
+    fruits, _, own = package
+    (own / "shipped.py").write_text("import no_such_module\n")
+    with pytest.raises(ModuleNotFoundError):
+        fruits.names()
