@@ -6,6 +6,7 @@ was started from it. So a program that starts others must say which of them answ
 
 from __future__ import annotations
 
+import atexit
 import contextlib
 import os
 import signal
@@ -20,6 +21,7 @@ from typing import Any
 
 STOPPING = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 _AGAIN_S = 0.3  # between two looks whether an interrupt has arrived
+_EXIT_S = 20.0  # how long the exit functions of a stopped program may take
 _PATIENCE = 3  # so many signals of the user's are obeyed even in the middle of tidying up
 _END_S = 5.0  # how long a child may take to end when asked, before it is killed
 
@@ -196,12 +198,25 @@ def _tidying_up() -> bool:
     return error is not None
 
 
-def settle() -> None:
-    """End the child processes of a program that was stopped; elsewhere they are not ours to end."""
-    if _program:
-        import multiprocessing
+def end_stopped(status: int) -> None:
+    """End a program that was stopped, and its child processes; where this process is no program of ours, return.
 
-        end_processes(multiprocessing.active_children())
+    Exit functions run, so that semaphores are given back. The interpreter is not taken apart: with the threads of
+    simulators and drivers in the state that an interrupt left them in, that may never end.
+    """
+    if not _program:
+        return
+    import multiprocessing
+
+    hang = threading.Timer(_EXIT_S, os._exit, (status,))
+    hang.daemon = True
+    hang.start()
+    end_processes(multiprocessing.active_children())
+    for stream in (sys.stdout, sys.stderr):
+        with contextlib.suppress(Exception):  # a closed pipe
+            stream.flush()
+    atexit._run_exitfuncs()
+    os._exit(status)
 
 
 def _answered() -> list[int]:

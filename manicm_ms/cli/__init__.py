@@ -449,10 +449,10 @@ def main(arguments: Sequence[str] | None = None) -> None:
     except OSError as error:
         code = _complain(_explain(error))
     except KeyboardInterrupt as stop:
-        signals.settle()
         goes_on = arguments[0] in _RESUMABLE if arguments else False
         print("stopped; the same command goes on from here" if goes_on else "stopped", file=sys.stderr)
         code = getattr(stop, "status", INTERRUPTED)
+        signals.end_stopped(code)
     sys.exit(code or 0)
 
 

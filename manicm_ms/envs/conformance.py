@@ -4,13 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 import torch
 from torch import Tensor
 
 from manicm_ms.envs.vec_env import Info, Obs, VecEnv, make_vec
-from manicm_ms.errors import ActionError, ManicmError
+from manicm_ms.errors import ActionError, ConfigError, ManicmError
 from manicm_ms.types import AGENT_POS, DEPTH, IMAGE, POINT_CLOUD, STATE, ChunkSpec
 
 _STEPS = 6
@@ -167,6 +168,31 @@ class _Checks:
                 continue
             raise ViolationError(f"an action with {name} was accepted")
 
+    def bad_resets_refused(self) -> None:
+        """Unknown options, masks of nobody and seeds out of range raise ConfigError, and harm nothing."""
+        self.env.reset(seed=list(_SEEDS))
+        bad: dict[str, dict[str, Any]] = {
+            "an unknown option": {"options": {"mask": np.array([True, False])}},
+            "a mask of nobody": {"options": {"reset_mask": np.array([False, False])}},
+            "a negative seed": {"seed": -1},
+            "a seed that is no whole number": {"seed": [0, 0.5]},
+        }
+        for name, request in bad.items():
+            try:
+                self.env.reset(**request)
+            except ConfigError as error:
+                _require("\n" not in str(error), f"the message about {name} has more than one line")
+                continue
+            raise ViolationError(f"a reset with {name} was accepted")
+        *_, info = self.env.step(self._actions(self.env)[0])
+        _require(info["elapsed_steps"].tolist() == [1, 1], "a refused reset has changed a row")
+
+    def last_seed_decides_later_resets(self) -> None:
+        """Resets without a seed go on from the last one, and differ from each other."""
+        first, again = [[self.env.reset(seed=seed)[0] for seed in (_SEEDS[0], None, None)] for _ in range(2)]
+        _assert_equal(first, again, "an episode without a seed, after the same seed,")
+        _require(any(not torch.equal(v, first[2][k]) for k, v in first[1].items()), "two such episodes start alike")
+
     def out_of_range_clipped_and_counted(self) -> None:
         """Entries beyond [-1, 1] act as the limit does, and are counted."""
         big = self._actions(self.env)[0].clone()
@@ -243,6 +269,8 @@ PROPERTIES: tuple[Callable[[_Checks], None], ...] = (
     _Checks.partial_reset_leaves_others,
     _Checks.unreset_row_goes_on,
     _Checks.bad_actions_refused,
+    _Checks.bad_resets_refused,
+    _Checks.last_seed_decides_later_resets,
     _Checks.out_of_range_clipped_and_counted,
     _Checks.info_complete,
     _Checks.chunk_equals_single_steps,
@@ -259,7 +287,8 @@ def check_vec_env(
     Checked are: it plays at all; spaces and dtypes; finite observations; the same seed gives the same episode, again,
     alone and in another environment; seeds differ; observations answer to actions and share no memory; a partial reset
     leaves the other rows as they are; NaN and misshapen actions are refused, those out of range clipped and counted;
-    info is complete; a chunk equals its single steps; the time limit truncates and freezes; closing twice is harmless.
+    bad seeds and unknown reset options are refused; the last seed decides later resets; info is complete; a chunk
+    equals its single steps; the time limit truncates and freezes; closing twice is harmless.
 
     On the cpu backend episodes are compared whole and bit for bit. On the gpu backend a seed promises the same start
     (docs/decisions/0010): the properties about equal episodes then compare the first frame alone, and "unreset row
