@@ -13,7 +13,17 @@ from manicm_ms import mujoco_gl
 mujoco_gl.prepare()  # before anything imports mujoco (ManiSkill's kinematics do)
 
 # Files that take longest, longest first: a worker gets whole files, and none should begin a long one at the end.
-LONGEST = ("benchmark/test_benchmark.py",)
+LONGEST = (
+    "benchmark/test_benchmark.py",
+    "evaluation/test_evaluate_slide_block.py",
+    "demos/test_collect.py",
+    "demos/test_store.py",
+    "envs/test_vec_env.py",
+    "cli/test_cli.py",
+    "benchmark/test_ray_cluster.py",
+    "envs/test_mujoco_suites.py",
+    "benchmark/test_benchmark_guide.py",
+)
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:

@@ -1,10 +1,12 @@
 """Finds the toy tasks' folder, and runs the command as a user does: in a process of its own, or in this one."""
 
 import importlib
+import io
 import os
 import signal
 import subprocess
 import sys
+from contextlib import redirect_stderr, redirect_stdout
 from pathlib import Path
 
 import pytest
@@ -38,17 +40,20 @@ def start_benchmark(benchmark_environment):
     return start
 
 
-@pytest.fixture
-def benchmark_here(monkeypatch, capsys):
+@pytest.fixture(scope="session")
+def benchmark_here():
     """Run the same command in this process, which saves the start of one; return its exit status and output."""
-    monkeypatch.setenv("MANICM_MS_TASKS", str(TOY_TASKS))  # for the processes that do the jobs
-    if str(TOY_TASKS) not in tasks.__path__:  # what the variable does where `tasks` is imported after it was set
-        tasks.__path__.append(str(TOY_TASKS))
-    importlib.import_module("manicm_ms.tasks.bench_points")
 
     def run(out, *words):
-        with pytest.raises(SystemExit) as end:
-            main(["benchmark", *OPTIONS, "--out", str(out), *map(str, words)])
-        return end.value.code, "".join(capsys.readouterr())
+        with pytest.MonkeyPatch.context() as patch, io.StringIO() as printed:
+            patch.setenv("MANICM_MS_TASKS", str(TOY_TASKS))  # for the processes that do the jobs
+            if (
+                str(TOY_TASKS) not in tasks.__path__
+            ):  # what the variable does where `tasks` is imported after it was set
+                tasks.__path__.append(str(TOY_TASKS))
+            importlib.import_module("manicm_ms.tasks.bench_points")
+            with redirect_stdout(printed), redirect_stderr(printed), pytest.raises(SystemExit) as end:
+                main(["benchmark", *OPTIONS, "--out", str(out), *map(str, words)])
+            return end.value.code, printed.getvalue()
 
     return run

@@ -33,10 +33,10 @@ def weights(out):
 
 
 @pytest.fixture(scope="module")
-def whole(tmp_path_factory, start_benchmark):
+def whole(tmp_path_factory, benchmark_here):
     """The grid run by two processes, uninterrupted."""
     out = tmp_path_factory.mktemp("bench") / "whole"
-    code, output = finish(start_benchmark(out, *EVALUATED, "--processes", 2))
+    code, output = benchmark_here(out, *EVALUATED, "--processes", 2)
     assert code == 0, output
     return out, output
 
@@ -117,9 +117,9 @@ def gone(pid):
         return True
 
 
-def begun(out, commands):
-    """Names of the jobs that the processes of some commands began, in no order; one begun twice comes twice."""
-    logs = [path for command in commands for path in (out / "logs").glob(f"{command.pid}-*")]
+def begun(out, pids):
+    """Names of the jobs that the processes of some commands began, sorted; one begun twice comes twice."""
+    logs = [path for pid in pids for path in (out / "logs").glob(f"{pid}-*")]
     lines = [line for path in logs for line in path.read_text().splitlines()]
     return sorted(line.removesuffix(": begun") for line in lines if line.endswith(": begun"))
 
@@ -129,7 +129,7 @@ def finished(out):
     return {name for path in out.glob("toy/**/*.json") if (name := json.loads(path.read_text()).get("job"))}
 
 
-def test_two_commands_share_the_work_and_go_on_after_both_are_stopped(whole, tmp_path, start_benchmark):
+def test_two_commands_share_the_work_and_go_on_after_both_are_stopped(whole, tmp_path, start_benchmark, benchmark_here):
     """Two begin at once; one is killed, the other gets Ctrl-C; two at once do the rest and end together."""
     out = tmp_path / "shared"
     pair = [start_benchmark(out, *EVALUATED, "--processes", count) for count in (1, 2)]
@@ -147,15 +147,16 @@ def test_two_commands_share_the_work_and_go_on_after_both_are_stopped(whole, tmp
         time.sleep(0.1)
     assert not (out / "results.json").exists()
     assert [path.read_text() for path in out.rglob("*.failed.json")] == [], "to be stopped is no failure"
-    claims, done = begun(out, pair), finished(out)
+    claims, done = begun(out, [process.pid for process in pair]), finished(out)
     assert len(claims) == len(set(claims)), "every job was begun by one of them alone"
     assert done <= set(claims)
 
-    pair = [start_benchmark(out, *EVALUATED, "--processes", 1) for _ in range(2)]
-    for process in pair:
-        code, output = finish(process)
+    other = start_benchmark(out, *EVALUATED, "--processes", 1)
+    for code, output in (benchmark_here(out, *EVALUATED, "--processes", 1), finish(other)):
         assert code == 0, output
-    assert begun(out, pair) == sorted(finished(whole[0]) - done), "every other job was done by one of them alone"
+    assert begun(out, [os.getpid(), other.pid]) == sorted(finished(whole[0]) - done), (
+        "every other job was done by one of them alone"
+    )
     assert finished(out) == finished(whole[0])
     assert len(finished(out)) == 12
     assert weights(out) == weights(whole[0]), "neither the stops nor the number of processes shows in the weights"
