@@ -113,10 +113,11 @@ _program = False  # whether this process runs one of ours, so that signals are o
 def quiet_start(programs: tuple[str, ...]) -> None:
     """From here on, end with one word where a signal stops this process while it still imports what it needs.
 
-    Does nothing unless the command that runs is one of `programs`: a library must leave signals alone.
+    Does nothing unless the command that runs is one of `programs`: a library must leave signals alone. Nor does it in a
+    worker process, which imports the same modules under the same name.
     """
     global _program
-    if os.path.basename(sys.argv[0]) in programs and signal.getsignal(signal.SIGINT) is signal.default_int_handler:
+    if os.path.basename(sys.argv[0]) in programs and not _is_child():
         _program = True
         for number in _answered():
             signal.signal(number, _end_at_once)
@@ -231,5 +232,8 @@ def _end_at_once(number: int, frame: FrameType | None) -> None:
 
 
 def _is_child() -> bool:
-    processes = sys.modules.get("multiprocessing.process")
-    return processes is not None and processes.parent_process() is not None
+    """Return whether this process was started by multiprocessing, or is being started: it has no parent there yet."""
+    processes: Any = sys.modules.get("multiprocessing.process")
+    if processes is None:
+        return False
+    return processes.parent_process() is not None or getattr(processes.current_process(), "_inheriting", False)

@@ -201,3 +201,17 @@ def test_a_worker_that_its_parent_ends_says_nothing(tmp_path):
     done = subprocess.run([sys.executable, script], capture_output=True, text=True, check=True, timeout=60)
     assert int(done.stdout) != 0
     assert done.stderr == ""
+
+
+def test_a_worker_that_imports_the_command_line_is_no_program(tmp_path):
+    """It has the command's name: what ends it must not be answered as the command answers."""
+    script = tmp_path / "manicm-ms"
+    script.write_text(
+        "import multiprocessing, signal\nfrom manicm_ms import cli\n\n"
+        "def look():\n    print(signal.getsignal(signal.SIGTERM) is signal.SIG_DFL)\n\n"
+        'if __name__ == "__main__":\n'
+        '    worker = multiprocessing.get_context("spawn").Process(target=look)\n'
+        "    worker.start()\n    worker.join()\n    look()\n"
+    )
+    done = subprocess.run([sys.executable, script], capture_output=True, text=True, check=True)
+    assert done.stdout.split() == ["True", "False"]
