@@ -85,8 +85,9 @@ def field_remarks(name: str, frames: np.ndarray, spec: EnvSpec) -> list[str]:
 
 
 def empty_clouds(clouds: np.ndarray) -> np.ndarray:
-    """Return which clouds of (F, P, C) hold nothing: all their points are equal; (F,) bool."""
-    return np.asarray((clouds[..., :3] == clouds[:, :1, :3]).all(axis=(1, 2)))
+    """Return which clouds of (F, P, C) hold nothing: all their points are equal, or the only one is 0; (F,) bool."""
+    first = clouds[:, :1, :3] if clouds.shape[1] > 1 else 0
+    return np.asarray((clouds[..., :3] == first).all(axis=(1, 2)))
 
 
 def window_remarks(lengths: np.ndarray, chunk: ChunkSpec) -> list[str]:

@@ -129,6 +129,9 @@ class _Surveyor:
         ends = self._read("meta/episode_ends")
         if ends is None:
             return
+        if ends.dtype.kind not in "iu":
+            self._problem(f"meta/episode_ends is {ends.dtype} where whole numbers belong")
+            return
         lengths = np.diff(ends, prepend=0)
         for k in np.flatnonzero(lengths <= 0)[:_MOST_NAMED]:
             before = ends[k - 1] if k else 0
@@ -174,7 +177,7 @@ class _Surveyor:
         if len(values) != self.result.frames:
             self._problem(self._mismatch(disk, len(values), self.result.frames, "frames"))
         values = values[: max(self.result.frames, 0)]
-        if values.dtype.kind != "f" or values.ndim < 2 or not len(values):
+        if values.dtype.kind != "f" or values.ndim < 2 or not values.size:
             return
         self._not_finite(disk, values)
         if name == "point_cloud" and values.ndim == 3:

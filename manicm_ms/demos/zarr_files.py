@@ -103,7 +103,7 @@ def missing_chunks(path: Path, name: str, array: zarr.Array, rows: int) -> list[
     """
     chunk = array.shards or array.chunks
     shape = (min(rows, array.shape[0]), *array.shape[1:])
-    counts = [range(-(-size // step)) for size, step in zip(shape, chunk, strict=True)]
+    counts = [range(-(-size // max(step, 1))) for size, step in zip(shape, chunk, strict=True)]
     there = _files(path / name)
     keys = (array.metadata.encode_chunk_key(place) for place in itertools.product(*counts))
     return [f"{name}/{key}" for key in keys if key not in there]

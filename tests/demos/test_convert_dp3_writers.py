@@ -17,6 +17,7 @@ from dp3_stores import ACTION_DIM, DIM, FRAMES, LENGTHS, POINTS, contents, rows,
 from manicm_ms.cli import USER_ERROR, main
 from manicm_ms.demos.convert import import_store
 from manicm_ms.demos.convert.dp3 import Dp3Options, Reading
+from manicm_ms.demos.convert.raw_store import RawStore
 from manicm_ms.demos.store import DemoStore
 from manicm_ms.demos.survey import survey
 from manicm_ms.errors import ConfigError, SpecMismatchError, StoreError
@@ -124,7 +125,7 @@ def test_lost_pictures_are_counted_and_named(tmp_path):
     assert "1 chunk file is missing: data/img/1.0.0.0" in notes
     assert not arrays["image"][5:10].any()
     (source / "data/point_cloud/0.0.0").unlink()
-    with pytest.raises(StoreError, match=r"no point.* in 5 of 12 .*frame 0 of episode 0; 2 chunk files are miss"):
+    with pytest.raises(StoreError, match=r"empty cloud.* in 5 of 12 .*frame 0 of episode 0; 2 chunk files are miss"):
         import_store(source, "dp3", tmp_path / "no.zarr")
 
 
@@ -279,7 +280,7 @@ def test_what_is_read_is_what_our_store_holds(tmp_path, capsys):
             np.testing.assert_array_equal(store.frames(name), values, strict=True)
 
 
-@pytest.mark.parametrize("ends", [[3.5, 12], [[3], [12]], [3, 3, 12], [np.nan, 12]])
+@pytest.mark.parametrize("ends", [[3.5, 12], [[3], [12]], [3, 3, 12], [np.nan, 12], [3, np.inf]])
 def test_ends_that_are_none_are_blamed_themselves(tmp_path, ends):
     source = write_dp3(tmp_path / "a.zarr", {"meta/episode_ends": np.array(ends)})
     refuse(source, StoreError, "meta/episode_ends (is .* where whole numbers on one axis belong|does not grow)")
@@ -382,3 +383,83 @@ def test_zipped_stores_and_files(tmp_path):
     only_pictures = write_dp3(tmp_path / "b.zarr", {"data/point_cloud": None, "data/img": pictures("u1")})
     with pytest.raises(StoreError, match=r"lacks data/point_cloud; it holds data/action, data/img, data/state, meta"):
         import_store(only_pictures, "dp3", tmp_path / "o.zarr")
+
+
+UNFIT = {
+    "no points": (
+        {"data/point_cloud": np.zeros((FRAMES, 0, 3), "f4")},
+        r"data/point_cloud is \(12, 0, 3\) float32 where",
+    ),
+    "no entries": ({"data/state": np.zeros((FRAMES, 0), "f4")}, r"data/state is \(12, 0\) float32 where 2 axes"),
+    "complex": ({"data/state": np.zeros((FRAMES, DIM), "c8")}, "complex64 where 2 axes of numbers belong"),
+    "bool": ({"data/action": np.ones((FRAMES, ACTION_DIM), bool)}, "bool where 2 axes of numbers belong"),
+    "equal points": (
+        {"data/point_cloud": np.full((FRAMES, POINTS, 3), 0.3)},
+        "empty cloud, all points equal, in 12 of 12",
+    ),
+    "chunks of actions": ({"data/action": np.ones((FRAMES, 8, 3))}, "where 2 axes of numbers belong, one row a frame"),
+    "bool ends": ({"meta/episode_ends": np.array([False, True])}, "episode_ends is bool where numbers belong"),
+}
+
+
+@pytest.mark.parametrize("kind", UNFIT)
+def test_what_no_policy_can_read_is_refused(tmp_path, kind):
+    changes, match = UNFIT[kind]
+    source = write_dp3(tmp_path / "a.zarr", changes)
+    refuse(source, StoreError, match)
+
+
+@pytest.mark.parametrize(
+    ("header", "match"),
+    [
+        ({"shape": [-3, DIM]}, "damaged, or coded by"),
+        ({"chunks": [0, DIM]}, "data/state cannot be read"),
+        ({"dtype": "|O"}, "damaged, or coded by"),
+        ({"dtype": "<U4", "fill_value": ""}, "where 2 axes of numbers belong"),
+        ({"compressor": 3}, "damaged, or coded by"),
+        (None, "damaged, or coded by"),
+    ],
+)
+def test_torn_headers_are_refused_in_a_line(tmp_path, header, match):
+    source = write_dp3(tmp_path / "a.zarr")
+    file = source / "data/state/.zarray"
+    file.write_text("null" if header is None else json.dumps(json.loads(file.read_text()) | header))
+    with pytest.raises(StoreError, match=match) as raised:
+        RawStore.open(source).read("agent_pos", 0, 1)
+    assert "\n" not in str(raised.value)
+
+
+OPTIONAL_UNFIT = {
+    "nan": ({"data/img": np.full((FRAMES, 4, 5, 3), np.nan)}, "data/img, which holds NaN or infinity"),
+    "four channels": ({"data/img": np.zeros((FRAMES, 4, 5, 4), "u1")}, r"where \(F, H, W, 3\) numbers are read"),
+    "few": ({"data/img": np.zeros((FRAMES - 1, 4, 5, 3), "u1")}, r"data/img, which is \(11, 4, 5, 3\) uint8 where"),
+    "negative": ({"data/depth": np.full((FRAMES, 4, 5), -1.0)}, "data/depth, which holds NaN, infinity or negative"),
+    "sizes": ({"data/img": pictures("u1"), "data/depth": np.ones((FRAMES, 2, 2))}, "data/depth, of another size"),
+}
+
+
+@pytest.mark.parametrize("kind", OPTIONAL_UNFIT)
+def test_optional_arrays_that_do_not_fit_are_left_out(tmp_path, kind):
+    changes, said = OPTIONAL_UNFIT[kind]
+    notes, _, _ = read(write_dp3(tmp_path / "a.zarr", changes))
+    assert re.search(f"left out: {said}", notes) or re.search(said, notes), notes
+
+
+def test_an_optional_array_of_another_codec_is_left_out(tmp_path):
+    source = write_dp3(tmp_path / "a.zarr", {"data/img": pictures("u1"), "data/depth": np.ones((FRAMES, 4, 5))})
+    for name, coding in (
+        ("data/img", {"compressor": {"id": "jpegxl"}}),
+        ("data/depth", {"filters": [{"id": "pickle"}]}),
+    ):
+        header = source / name / ".zarray"
+        header.write_text(json.dumps(json.loads(header.read_text()) | coding))
+    notes, arrays, _ = read(source)
+    assert set(arrays) == {"point_cloud", "agent_pos", "action"}
+    assert re.search(r"left out: data/img, which cannot be opened \(.*jpegxl", notes)
+    assert "left out: data/depth, which is pickled" in notes
+
+
+def test_colours_that_are_not_wanted_may_be_anything(tmp_path):
+    source = write_dp3(tmp_path / "a.zarr", {"data/point_cloud": colored(np.full_like(UNIT, np.nan))})
+    read(source)
+    refuse(source, StoreError, "data/point_cloud holds NaN", colors=True)

@@ -65,6 +65,10 @@ def resize(array, length):
     return damage
 
 
+def resize_entries(path):
+    zarr.open_group(str(path), mode="r+").create_array("data/state", data=np.zeros((9, 0), "f4"), overwrite=True)
+
+
 def write(name, content):
     return lambda path: (path / name).write_bytes(content)
 
@@ -94,6 +98,13 @@ DAMAGES = {
     "torn attributes": (write(".zattrs", b'{"format": "manicm'), "attributes .* cannot be read"),
     "list attributes": (write(".zattrs", b"[1, 2]"), "not written by"),
     "foreign attributes": (write(".zattrs", b"{}"), "not written by"),
+    "float ends": (
+        lambda path: zarr.open_group(str(path), mode="r+").create_array(
+            "meta/episode_ends", data=np.array([1.0, np.inf]), overwrite=True
+        ),
+        "meta/episode_ends is float64 where whole numbers belong",
+    ),
+    "no entries": (resize_entries, r"data/state has frames of \(0,\) float32"),
     "lost file": (lambda path: (path / "data/action/1.0").unlink(), "1 chunk file is missing: data/action/1.0: lost"),
     "old attributes": (write(".zattrs", b'{"format": "manicm_ms demos 1", "env_spec": {}}'), "attributes .* damaged"),
 }

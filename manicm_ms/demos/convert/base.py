@@ -12,7 +12,7 @@ from typing import Any, Protocol
 
 import numpy as np
 
-from manicm_ms.demos.remarks import store_remarks
+from manicm_ms.demos.remarks import empty_clouds, store_remarks
 from manicm_ms.demos.store import DemoStore, Episode
 from manicm_ms.errors import ManicmError, NoSpaceError, OutputExistsError, StoreError
 from manicm_ms.paths import is_disk_full, require_free_space, sync_tree, temporary_folder
@@ -220,14 +220,14 @@ def _taken(out: Path) -> OutputExistsError:
 
 
 def _sound(store: DemoStore, number: int) -> Episode:
-    """Return an episode; raise StoreError where its numbers are not finite, or zeros stand for a file that was lost."""
+    """Return an episode; raise StoreError where its numbers are not finite or a cloud is empty."""
     episode = store.episode(number)
     for name in store.fields:
         values = getattr(episode, name)
         if values.dtype.kind == "f" and not np.isfinite(values).all():
             raise _damaged(store, number, f"{name} holds NaN or infinity")
-    if (episode.point_cloud[..., :3] == 0).all(axis=(1, 2)).any():
-        raise _damaged(store, number, "point_cloud has frames of zeros alone, as a lost file leaves them")
+    if empty_clouds(episode.point_cloud).any():
+        raise _damaged(store, number, "point_cloud has empty clouds, as a lost file leaves them")
     return episode
 
 

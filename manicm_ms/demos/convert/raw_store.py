@@ -107,7 +107,7 @@ class RawStore:
     def _check(self) -> None:
         for name, array in self.arrays.items():
             disk, axes = REQUIRED[name], 3 if name == "point_cloud" else 2
-            if array.ndim != axes or array.dtype.kind not in "fiu":
+            if array.ndim != axes or array.dtype.kind not in "fiu" or 0 in array.shape[1:]:
                 raise StoreError(
                     f"{self.path}: {disk} is {array.shape} {array.dtype} where {axes} axes of numbers belong, "
                     "one row a frame"
@@ -132,11 +132,12 @@ class RawStore:
             try:
                 array = open_array(self.path, disk)
             except StoreError as error:
-                self.leave_out(name, str(error))
+                why = f"which cannot be opened ({one_line(error.__cause__)})" if error.__cause__ else "which is pickled"
+                self.leave_out(name, why)
                 continue
             wanted = "(F, H, W, 3)" if name == "image" else "(F, H, W)"
             fits = array.ndim == (4 if name == "image" else 3) and (name != "image" or array.shape[3] == 3)
-            if not fits or array.shape[0] < self.num_frames or array.dtype.kind not in "fiu":
+            if not fits or array.shape[0] < self.num_frames or array.dtype.kind not in "fiu" or 0 in array.shape:
                 self.leave_out(name, f"which is {array.shape} {array.dtype} where {wanted} numbers are read")
             elif size and array.shape[1:3] != size:
                 self.leave_out(name, f"of another size, {array.shape[1:3]}, than the pictures")
@@ -166,7 +167,7 @@ def _require_layout(path: Path, names: tuple[str, ...]) -> None:
 def _ends(path: Path) -> np.ndarray:
     """Return the ends of the episodes, (E,) int64; raise StoreError where they are not growing whole numbers."""
     ends = _read(path, EPISODE_ENDS, open_array(path, EPISODE_ENDS))
-    if ends.ndim != 1 or ends.dtype.kind not in "iuf" or (ends != np.floor(ends)).any():
+    if ends.ndim != 1 or not np.isfinite(ends).all() or (ends != np.floor(ends)).any():
         raise StoreError(f"{path}: {EPISODE_ENDS} is {ends.shape} {ends.dtype} where whole numbers on one axis belong")
     if not len(ends):
         raise StoreError(f"{path} holds no episodes: nothing to convert")

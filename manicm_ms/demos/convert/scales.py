@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from manicm_ms.demos.convert.raw_store import POINT_CLOUD, RawStore
-from manicm_ms.demos.remarks import COLOR_SLACK, MOST_DEPTH, MOST_METRES, metres_remark
+from manicm_ms.demos.remarks import COLOR_SLACK, MOST_DEPTH, MOST_METRES, empty_clouds, metres_remark
 from manicm_ms.errors import ConfigError, SpecMismatchError, StoreError
 
 _ACTION_SLACK = 1e-5  # of rounding, beyond [-1, 1]
@@ -77,7 +77,7 @@ def decide(
             raise ConfigError(f"--{name}-scale must be positive, got {scale}")
     _look_at_state(raw)
     action = _action_scale(raw, action_scale)
-    facts = _look_at_clouds(raw)
+    facts = _look_at_clouds(raw, channels=6 if colors else 3)
     metres = _metres(raw, facts, cloud_scale)
     _keep_pictures(raw)
     return Scales(metres, _color_scale(raw, facts) if colors else _no_colors(raw), action, _depth(raw, depth_scale))
@@ -98,7 +98,7 @@ class _CloudFacts:
     rgb_whole: bool = True
 
     def add(self, xyz: np.ndarray, rgb: np.ndarray) -> np.ndarray:
-        """Count clouds (F, P, 3) and colours (F, P, 3 or 0); return which frames hold no point, (F,) bool."""
+        """Count clouds (F, P, 3) and colours (F, P, 3 or 0); return which frames are empty clouds, (F,) bool."""
         size, at_origin = np.abs(xyz.astype(np.float64)).max(axis=-1), (xyz == 0).all(axis=-1)
         self.points += size.size
         self.padding += int(at_origin.sum())
@@ -109,19 +109,20 @@ class _CloudFacts:
             self.rgb_low, self.rgb_high = min(self.rgb_low, float(rgb.min())), max(self.rgb_high, float(rgb.max()))
         self.rgb_above += int((rgb > 1 + COLOR_SLACK).sum())
         self.rgb_whole = self.rgb_whole and bool((rgb == np.floor(rgb)).all())
-        return np.asarray(at_origin.all(axis=1))
+        return empty_clouds(xyz)
 
 
-def _look_at_clouds(raw: RawStore) -> _CloudFacts:
+def _look_at_clouds(raw: RawStore, channels: int) -> _CloudFacts:
     facts = _CloudFacts()
     empty: list[int] = []
     for start, block in raw.blocks("point_cloud"):
+        block = block[..., :channels]
         _require_finite(raw, POINT_CLOUD, start, block)
         empty += (start + np.flatnonzero(facts.add(block[..., :3], block[..., 3:]))).tolist()
     if empty:
         raise StoreError(
-            f"{raw.path}: {POINT_CLOUD} holds no point, all at the origin, in {len(empty)} of {raw.num_frames} frames, "
-            f"the first is {raw.place(empty[0])}{raw.say_missing()}"
+            f"{raw.path}: {POINT_CLOUD} holds an empty cloud, all points equal, in {len(empty)} of {raw.num_frames} "
+            f"frames, the first is {raw.place(empty[0])}{raw.say_missing()}"
         )
     if facts.padding:
         raw.notes.append(f"{facts.padding} of {facts.points} points are at exactly (0, 0, 0), as padding is: dropped")
@@ -189,6 +190,9 @@ def _keep_pictures(raw: RawStore) -> None:
         return
     low, high, whole = np.inf, -np.inf, True
     for _, block in raw.blocks("image"):
+        if not np.isfinite(block).all():
+            raw.leave_out("image", "which holds NaN or infinity")
+            return
         low, high = min(low, float(block.min())), max(high, float(block.max()))
         whole = whole and bool((block == np.floor(block)).all())
     if whole and low >= 0 and high <= _BYTE:
@@ -211,8 +215,8 @@ def _depth(raw: RawStore, given: float | None) -> float:
         return 1.0
     read, far, reach = 0, 0, 0.0
     for _, block in raw.blocks("depth"):
-        if not np.isfinite(block).all():
-            raw.leave_out("depth", "which holds NaN or infinity")
+        if not np.isfinite(block).all() or (block < 0).any():
+            raw.leave_out("depth", "which holds NaN, infinity or negative values")
             return 1.0
         read, far = read + int((block > 0).sum()), far + int((block > MOST_DEPTH).sum())
         reach = max(reach, float(block.max()))
