@@ -42,7 +42,8 @@ def read_poses(path: Path) -> dict[str, RigidTransform]:
     Raises CalibrationError naming the file, the image and the field.
     """
     if not path.is_file():
-        raise CalibrationError(f"{path} does not exist: give the robot's poses as {_FORMS}")
+        what = "is no file" if path.exists() else "does not exist"
+        raise CalibrationError(f"{path} {what}: give the robot's poses as {_FORMS}")
     try:
         text = _decoded(path.read_bytes())
         rows = _from_json(text) if path.suffix.lower() == ".json" else _from_csv(text)

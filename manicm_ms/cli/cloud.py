@@ -59,14 +59,14 @@ def cloud(depth: Path, camera: Path, out: Path, env: str, realism: str, num_poin
         f"{out}: {num_points} points, {distinct} of them distinct, of {count} readings in the crop; "
         f"{100 * _seen(readings, model, box):.0f} % of these lie in the workspace"
     )
+    if (far := float((readings > _FAR_M).sum()) / count) > _NOTABLE:
+        print(f"{100 * far:.0f} % of the readings are beyond {_FAR_M:g} m: does the camera write 65535 for no reading?")
     if distinct < min(num_points, _FEW):
         print(f"only {distinct} points are seen: {why_nothing_is_seen(readings, model, box)}")
 
 
 def why_nothing_is_seen(readings: Tensor, camera: CameraModel, box: Box) -> str:
-    """Return where the readings lie, where the workspace is, and what most likely brings the one not into the other.
-
-    The likely cause is the usual mistake whose correction brings most readings into the workspace.
+    """Return where the readings lie, where the workspace is, and the likely cause that the one is not in the other.
 
     Args:
         readings: (h, w) float32 of the camera's crop, metres; 0 = no reading.
@@ -77,11 +77,20 @@ def why_nothing_is_seen(readings: Tensor, camera: CameraModel, box: Box) -> str:
     spans = (f"{axis} {low:.2f} to {high:.2f}" for axis, low, high in zip("xyz", box.low, box.high, strict=True))
     found = np.percentile(points, (2, 98), axis=0).T
     lies = (f"{axis} {low:.2f} to {high:.2f}" for axis, (low, high) in zip("xyz", found, strict=True))
+    return (
+        f"it reads {', '.join(lies)} m, the workspace is {', '.join(spans)} m; {_likely_cause(readings, camera, box)}"
+    )
+
+
+def _likely_cause(readings: Tensor, camera: CameraModel, box: Box) -> str:
+    """Return the usual mistake whose correction brings most readings into the workspace, or a question."""
+    if _seen(readings, camera, box._replace(low=(*box.low[:2], -_TABLE_M))) > _LIKELY:
+        return f"the table is seen, and nothing above {1000 * box.low[2]:g} mm: is anything else there?"
     shares = {cause: _seen(readings * scale, other, box) for cause, scale, other in _usual_mistakes(camera)}
-    likely = max(shares, key=lambda cause: shares[cause], default="")
-    if not likely or shares[likely] < max(_LIKELY, 2 * _seen(readings, camera, box)):
-        likely = "is T_base_camera that of this cell, in the robot-base frame, and --env the right one?"
-    return f"it reads {', '.join(lies)} m, the workspace is {', '.join(spans)} m; {likely}"
+    likely = max(shares, key=lambda cause: shares[cause])
+    if shares[likely] > max(_LIKELY, 2 * _seen(readings, camera, box)):
+        return likely
+    return "is T_base_camera that of this cell, in the robot-base frame, and --env the right one?"
 
 
 def _usual_mistakes(camera: CameraModel) -> Iterator[tuple[str, float, CameraModel]]:
@@ -128,6 +137,9 @@ def _npy(points: NDArray[np.float32]) -> bytes:
 
 
 _FEW = 64  # distinct points, below which it is asked why
+_FAR_M = 20.0  # no depth camera reads so far
+_NOTABLE = 0.01  # share of the readings
+_TABLE_M = 0.02  # that the table's readings may lie too low
 _LIKELY = 0.05  # share of the readings that a correction must bring into the workspace to be named
 _UNITS = (1e-3, 1e-4, 2.5e-4, 1e-2)  # metres: a RealSense as delivered, an L515 or Zivid, an L515 of old, centimetres
 _HALF_TURN = np.diag([-1.0, -1.0, 1.0, 1.0])  # about z

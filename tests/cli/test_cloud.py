@@ -120,6 +120,25 @@ def test_a_camera_that_looks_elsewhere_gives_no_cloud(recording, told):
     assert "is T_base_camera that of this cell" in line
 
 
+def test_an_empty_table_is_no_workspace_and_no_wrong_pose(recording, told):
+    camera = default_camera()
+    v, u = np.indices((camera.height, camera.width))
+    rays = np.stack([(u - camera.cx) / camera.fx, (v - camera.cy) / camera.fy, np.ones_like(u)], axis=-1)
+    depth = (0.004 - camera.pose[2, 3]) / (rays @ camera.pose[2, :3])
+    write_depth(recording / "depth.png", torch.from_numpy(depth), camera)
+    assert "the table is seen, and nothing above 12 mm" in refused(recording, told)
+
+
+def test_readings_that_no_camera_makes_are_said(recording, told):
+    raw = cv2.imread(str(recording / "depth.png"), cv2.IMREAD_UNCHANGED)
+    raw[raw == 0] = 65535
+    assert cv2.imwrite(str(recording / "depth.png"), raw)
+    out = recording / "cloud.npy"
+    status, said, _ = told(recording / "depth.png", "--camera", recording / "camera.yaml", "--out", out)
+    assert status == 0
+    assert re.search(r"5 % of the readings are beyond 20 m: does the camera write 65535 for no reading\?", said)
+
+
 BODY = np.array([[0, 0, 1], [-1, 0, 0], [0, -1, 0]], float).T  # OpenCV's axes -> x forward, y left, z up
 
 
