@@ -222,7 +222,7 @@ def evaluate_command(
     allow_seen_seeds: bool = False,
     to_the_end: bool = True,
 ) -> int:
-    """Judge checkpoints on the same fresh seeds: success with intervals, paired difference, decision latency, report.
+    """Evaluate checkpoints on the same fresh seeds: success with intervals, paired difference, latency, report.
 
     Args:
         checkpoints: checkpoint folders, the teacher first and the student last.

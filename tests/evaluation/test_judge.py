@@ -9,6 +9,7 @@ import pytest
 from point_mass import SPEC, PointMass, Proportional
 from rich.console import Console
 
+from manicm_ms.cli import evaluate_command
 from manicm_ms.errors import ConfigError, OutputExistsError, SpecMismatchError
 from manicm_ms.evaluation.contenders import CONTROL, STUDENT, TEACHER, Contender, require_made_for
 from manicm_ms.evaluation.intervals import rate_interval
@@ -206,7 +207,7 @@ def test_a_policy_alone_is_judged_without_a_pair(tmp_path):
     assert "On the same" not in render_markdown(results)
 
 
-def test_where_every_episode_crashed_there_is_no_rate(tmp_path):
+def test_where_every_episode_crashed_there_is_no_rate(tmp_path, monkeypatch):
     seeds, out = SEEDS[:3], tmp_path / "report"
     results, printed = run(out, seeds=seeds, crash_at=dict.fromkeys(seeds, 1), videos=1)
     for policy in results["policies"]:
@@ -218,8 +219,12 @@ def test_where_every_episode_crashed_there_is_no_rate(tmp_path):
     for text in (printed, (out / "report.md").read_text(), (out / "report.html").read_text()):
         assert "3 = -" in text
         assert "0.0 %" not in text
+    monkeypatch.setattr("manicm_ms.evaluation.judge.evaluate", lambda *args, **options: results)
+    assert evaluate_command((out,), SPEC.env_id) == 1, "the exit status"
     mixed, _ = run(tmp_path / "mixed", seeds=seeds, crash_at=dict.fromkeys(seeds[:2], 1), videos=0)
     assert without_rate(mixed) == []
+    monkeypatch.setattr("manicm_ms.evaluation.judge.evaluate", lambda *args, **options: mixed)
+    assert evaluate_command((out,), SPEC.env_id) == 0
 
 
 def test_success_at_some_step_and_at_the_last_stand_in_every_report(tmp_path):

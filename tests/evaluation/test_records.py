@@ -1,5 +1,6 @@
 """An evaluation's folder survives kills and refuses strangers."""
 
+import dataclasses
 import json
 import multiprocessing
 import os
@@ -11,7 +12,7 @@ from point_mass import PointMass, Proportional
 
 from manicm_ms.errors import OutputExistsError
 from manicm_ms.evaluation.records import EpisodeLog, claimed_folder
-from manicm_ms.evaluation.rollout import rollout
+from manicm_ms.evaluation.rollout import EpisodeResult, rollout
 
 REQUEST = {"env_id": "toy/point-mass", "seed": 1, "policies": [["a", "teacher", "ff"]]}
 
@@ -31,6 +32,16 @@ def test_a_log_returns_what_was_appended(tmp_path):
         log.append(results[2])
     with EpisodeLog(tmp_path / "a.jsonl") as log:
         assert len(log) == 3
+
+
+def test_a_record_of_an_earlier_version_is_read_and_leaves_open_what_it_does_not_say(tmp_path):
+    (result,) = episodes([1])
+    record = result.to_record()
+    old = {key: value for key, value in record.items() if key not in ("success_once", "success_at_end")}
+    (tmp_path / "a.jsonl").write_text(json.dumps(old) + "\n")
+    with EpisodeLog(tmp_path / "a.jsonl") as log:
+        assert log[1] == dataclasses.replace(result, success_once=None, success_at_end=None)
+        assert EpisodeResult.from_record(record) == result
 
 
 def test_a_torn_last_line_is_cut_and_its_episode_played_again(tmp_path):
