@@ -1,10 +1,12 @@
 """`import manicm_ms` makes ids known to Gymnasium; what they name is imported when it is made, and keeps its checks."""
 
 import json
+import re
 import subprocess
 import sys
 from contextlib import closing
 from importlib.util import find_spec
+from pathlib import Path
 
 import gymnasium
 import numpy as np
@@ -146,6 +148,15 @@ def test_a_row_is_that_of_the_seed_and_ends_at_its_time_limit():
 def test_an_unknown_render_mode_is_refused():
     with pytest.raises(ConfigError, match="ur3e/slide-block has no render_mode 'human': use 'rgb_array' or None"):
         SingleEnv("ur3e/slide-block", render_mode="human")
+
+
+@suites
+def test_the_page_s_example_runs():
+    page = (Path(__file__).parents[1] / "docs" / "suites.md").read_text(encoding="utf-8")
+    (block,) = re.findall(r"^```python\n(.*?)^```$", page, re.DOTALL | re.MULTILINE)
+    told = {}
+    exec(block, told)
+    assert told["obs"]["state"].shape == (39,)
 
 
 # ---- many rows ------------------------------------------------------------------------------------------------------
