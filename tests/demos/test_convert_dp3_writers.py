@@ -271,10 +271,11 @@ def test_what_is_read_is_what_our_store_holds(tmp_path, capsys):
     assert "3 episodes, 12 frames" in said
     assert "action never changes in 12 frames: an idle robot, or lost data" in said
     assert "point_cloud reaches 65.54 m, 0.208 % of it beyond 10 m: likely stray readings of a camera" in said
-    _, arrays, spec = read(source, action_scale=(2.0, 3.0, 4.0), depth_scale=0.001, control_hz=20.0)
+    notes, arrays, spec = read(source, action_scale=(2.0, 3.0, 4.0), depth_scale=0.001, control_hz=20.0)
     with DemoStore.open(out) as store:
         assert store.spec == spec
         assert store.provenance["scales"] == {"cloud": None, "depth": 0.001, "action": [2.0, 3.0, 4.0]}
+        assert " | ".join(store.provenance["notes"]) == notes
         assert set(store.fields) == set(arrays)
         for name, values in arrays.items():
             np.testing.assert_array_equal(store.frames(name), values, strict=True)

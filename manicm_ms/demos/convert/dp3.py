@@ -208,6 +208,7 @@ def _provenance(raw: RawStore, asked: Dp3Options, spec: EnvSpec) -> dict[str, An
         "points": f"{points} points of each frame resampled to {spec.obs.num_points} in farthest-point order",
         "assumed": "frame, units and meaning of entries as in env_spec; every episode solved",
         "scales": {"cloud": asked.cloud_scale, "depth": asked.depth_scale, "action": list(asked.action_scale)},
+        "notes": raw.notes,
         "command": asked.command,
         "versions": package_versions(),
     }
