@@ -471,9 +471,12 @@ class DemoStore:
         rows |= {f"meta/{name}": len(self) for name in (*self._meta_names(), "episode_ends")}
         missing = [m for name, n in rows.items() for m in missing_chunks(self.path, name, self._array(name), n)]
         if missing and ALL_WRITTEN.items() <= self._attrs.items():
-            raise StoreError(
-                f"{self.path} is damaged: {say_missing(missing)}; bring them back, or collect into another folder"
-            )
+            hit = sorted({name.rpartition("/")[0] for name in missing})
+            spare = {f"data/{FRAME_ARRAYS[field]}" for field in OPTIONAL_FIELDS}
+            way = "collect into another folder"
+            if spare.issuperset(hit):
+                way = f"remove {', '.join(hit)}, which a store can do without"
+            raise StoreError(f"{self.path} is damaged: {say_missing(missing)}; bring them back, or {way}")
         return tuple(missing)
 
 

@@ -3,6 +3,7 @@
 import json
 import os
 import resource
+import shutil
 import subprocess
 import sys
 import tempfile
@@ -15,6 +16,7 @@ import zarr
 from store_samples import PROVENANCE, SPEC, episode, make_store, require_same
 
 from manicm_ms.demos.store import DemoStore, Episode
+from manicm_ms.demos.survey import survey
 from manicm_ms.errors import NoSpaceError, OutputExistsError, StoreError
 from manicm_ms.paths import exclusive_lock
 
@@ -307,6 +309,21 @@ def test_every_chunk_has_a_file_and_one_that_is_lost_is_missed(tmp_path):
                 DemoStore.open(path, mode)
         (path / name).write_bytes(content)
     DemoStore.open(path).close()
+
+
+def test_lost_pictures_can_be_given_up(tmp_path):
+    path = make_store(tmp_path / "a.zarr", SEEDS[:2], extras=("image", "depth"))
+    for name in ("data/img/0.0.0.0", "data/depth/0.0.0"):
+        (path / name).unlink()
+    with pytest.raises(
+        StoreError, match=r"2 chunk files are missing: .*bring them back, or remove data/depth, data/img, w"
+    ):
+        DemoStore.open(path)
+    for name in ("img", "depth"):
+        shutil.rmtree(path / "data" / name)
+    with DemoStore.open(path) as store:
+        require_same(store.episode(1), episode(SEEDS[1]))
+    assert survey(path).problems == []
 
 
 def test_a_store_of_earlier_versions_is_extended(tmp_path):
