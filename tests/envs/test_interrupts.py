@@ -76,7 +76,7 @@ def test_a_call_that_was_interrupted_leaves_an_environment_that_says_so_and_clos
 
     before = signal.signal(signal.SIGALRM, interrupt)
     try:
-        for _ in range(5):
+        for _ in range(3):
             env = make_vec(SOUND, 2, "cpu")
             env.reset(seed=0)
             with pytest.raises(KeyboardInterrupt):
