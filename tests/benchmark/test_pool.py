@@ -2,6 +2,8 @@
 
 import io
 import json
+import subprocess
+import sys
 import time
 from pathlib import Path
 
@@ -90,3 +92,29 @@ def test_deaths_of_an_earlier_run_do_not_count(job):
     job.stem.parent.mkdir(parents=True)
     write_json(job.begun_file, {"tries": 3})
     assert attempt(job, console(), started=time.time() + 60) == DONE
+
+
+STUBBORN = """
+import multiprocessing, os, signal, time
+from manicm_ms.benchmark import pool
+
+def stubborn():
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # an interrupt that gets lost
+    pool._STOP_S = 0.2
+    pool._end_with_parent()
+    print(os.getpid(), flush=True)
+    time.sleep(600)
+
+if __name__ == "__main__":
+    multiprocessing.get_context("fork").Process(target=stubborn).start()
+    time.sleep(600)
+"""
+
+
+def test_a_job_ends_with_the_process_that_started_it_even_if_the_interrupt_is_lost(tmp_path):
+    (tmp_path / "stubborn.py").write_text(STUBBORN)
+    parent = subprocess.Popen([sys.executable, tmp_path / "stubborn.py"], stdout=subprocess.PIPE, text=True)
+    job = Path("/proc") / parent.stdout.readline().strip()
+    assert job.exists()
+    parent.kill()
+    parent.communicate(timeout=30)  # until the job, which holds the other end, has ended as well
