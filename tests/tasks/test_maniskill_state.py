@@ -1,7 +1,9 @@
 """ManiSkill's state contract: what was got, set again, goes on as it did: here, elsewhere, flat and from files."""
 
 import copy
+import shutil
 
+import gymnasium as gym
 import h5py
 import numpy as np
 import pytest
@@ -9,6 +11,7 @@ import torch
 
 import manicm_ms.envs.maniskill  # noqa: F401  (chooses the Vulkan driver before SAPIEN is imported)
 
+from mani_skill.trajectory import replay_trajectory  # isort: skip
 from mani_skill.trajectory import utils as trajectory_utils  # isort: skip
 from mani_skill.utils.wrappers import RecordEpisode  # isort: skip
 from mani_skill.utils.wrappers.cached_reset import CachedResetWrapper  # isort: skip
@@ -231,3 +234,53 @@ def test_cached_resets_keep_the_targets(plain_env):
     env.unwrapped.reset(seed=0)
     agent = env.unwrapped.agent
     assert torch.equal(agent.tcp_target_pose, agent.tcp_pose_at_base), "a new episode starts from what is measured"
+
+
+@pytest.fixture(scope="module")
+def recording(tmp_path_factory):
+    """A solved Stack Cube episode, as ManiSkill's recorder writes it, and the same as earlier versions wrote it."""
+    folder = tmp_path_factory.mktemp("recording")
+    env = gym.make(stack_cube.GYM_ID, num_envs=1, obs_mode="none", reward_mode="sparse", sim_backend="physx_cpu")
+    recorder = RecordEpisode(env, str(folder), trajectory_name="now", save_video=False)
+    recorder.reset(seed=SEED, options={"reconfigure": True})
+    expert = EXPERTS.get(stack_cube.ENV_ID)(stack_cube.SPEC, 1, torch.device("cpu"), None)
+    expert.reset(env.unwrapped.privileged_state(), [SEED], torch.ones(1, dtype=torch.bool))
+    done = False
+    while not done:
+        *_, terminated, truncated, info = recorder.step(expert.act(env.unwrapped.privileged_state()))
+        done = bool(terminated | truncated)
+    assert info["success"].item()
+    recorder.close()
+    for kind in (".h5", ".json"):
+        shutil.copy(folder / f"now{kind}", folder / f"earlier{kind}")
+    with h5py.File(folder / "earlier.h5", "a") as file:
+        states = file["traj_0/env_states"]
+        for part in ("asleep", "task", "controller/gripper", "controller/arm/target_qpos"):
+            del states[part]
+    return folder
+
+
+@pytest.mark.parametrize(
+    ("version", "options", "solved"),
+    [
+        ("now", ["--use-env-states", "--save-traj"], True),
+        ("now", ["--use-first-env-state", "--save-traj"], True),
+        ("earlier", ["--save-traj"], True),
+        ("earlier", ["--use-env-states"], True),
+        ("earlier", ["--use-env-states", "--save-traj"], False),  # ManiSkill copies what earlier files do not hold
+    ],
+)
+def test_maniskills_replay(recording, tmp_path, version, options, solved, capsys):
+    for kind in (".h5", ".json"):
+        shutil.copy(recording / f"{version}{kind}", tmp_path / f"{version}{kind}")
+    arguments = replay_trajectory.parse_args(["--traj-path", str(tmp_path / f"{version}.h5"), *options])
+    if not solved:
+        with pytest.raises(KeyError, match="target_qpos"):
+            replay_trajectory.main(arguments)
+        return
+    replay_trajectory.main(arguments)
+    assert "1/1=100.00% demos saved" in capsys.readouterr().out
+    if "--save-traj" in options:
+        (written,) = [path for path in tmp_path.glob("*.h5") if path.name != f"{version}.h5"]
+        with h5py.File(written) as file:
+            assert file["traj_0/env_states/task/white_start"].shape[1] == 7
