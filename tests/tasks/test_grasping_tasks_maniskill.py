@@ -26,12 +26,9 @@ def task(request):
     return request.param
 
 
-@pytest.fixture(scope="module")
-def env(task):
-    """One environment without pictures, shared: building takes longer than playing."""
-    env = gym.make(task.GYM_ID, num_envs=1, obs_mode="none", reward_mode="normalized_dense", sim_backend="physx_cpu")
-    yield env
-    env.close()
+@pytest.fixture
+def env(task, plain_env):
+    return plain_env(task.GYM_ID)
 
 
 def expert_episode(task, env, seed, on_step):
@@ -115,14 +112,11 @@ def test_made_by_its_id_alone(task):
 # ---- Transfer Piece alone -------------------------------------------------------------------------------------------
 
 
-def test_half_closed_fingers_fit_between_the_walls_and_fully_open_ones_do_not():
+def test_half_closed_fingers_fit_between_the_walls_and_fully_open_ones_do_not(plain_env):
     """Why the task says "partially close": the same way-points with an open gripper meet the box."""
-    env = gym.make(transfer_piece.GYM_ID, num_envs=1, obs_mode="none", sim_backend="physx_cpu")
-    try:
-        assert largest_force_on_box(env, transfer_piece.INSERT_OPENING) < 1.0
-        assert largest_force_on_box(env, transfer_piece.OPENING_MAX) > 5.0
-    finally:
-        env.close()
+    env = plain_env(transfer_piece.GYM_ID)
+    assert largest_force_on_box(env, transfer_piece.INSERT_OPENING) < 1.0
+    assert largest_force_on_box(env, transfer_piece.OPENING_MAX) > 5.0
 
 
 def largest_force_on_box(env, opening):

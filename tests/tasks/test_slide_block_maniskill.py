@@ -25,12 +25,9 @@ def make(**options):
     return gym.make(GYM_ID, **{"num_envs": 1, "sim_backend": "physx_cpu"} | options)
 
 
-@pytest.fixture(scope="module")
-def env():
-    """One environment without pictures, shared: building takes longer than playing."""
-    env = make(obs_mode="none", reward_mode="normalized_dense")
-    yield env
-    env.close()
+@pytest.fixture
+def env(plain_env):
+    return plain_env(GYM_ID)
 
 
 def expert_episode(env, seed, on_step=lambda *_: None, style=None):
@@ -179,8 +176,6 @@ def test_maniskill_vector_env_resets_by_itself_and_tells_the_final_info():
 
 def cpu_row():
     """Return one row as ManiSkill's CPU users make it; a worker process imports it by name."""
-    import manicm_ms.tasks.slide_block  # noqa: F401  (registers the id in the worker)
-
     torch.set_num_threads(1)
     return CPUGymWrapper(make(obs_mode="state"), ignore_terminations=True, record_metrics=True)
 
