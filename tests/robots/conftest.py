@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import sys
 from collections.abc import Iterator
 from pathlib import Path
@@ -15,18 +16,31 @@ if str(SCRIPTS) not in sys.path:
     sys.path.insert(0, str(SCRIPTS))
 
 
+@pytest.fixture(scope="session")
+def _made() -> Iterator[dict[Any, list[Any]]]:
+    """Environments by what they were made with; building one takes longer than playing most tests."""
+    torch.set_num_threads(1)
+    made: dict[Any, list[Any]] = {}
+    yield made
+    for env in itertools.chain(*made.values()):
+        env.close()
+
+
 @pytest.fixture
-def make_robot_env() -> Iterator[Any]:
-    """Return a factory of `GripperHoldEnv`; what it made is closed at the end."""
+def make_robot_env(_made: dict[Any, list[Any]]) -> Any:
+    """Return a factory of `GripperHoldEnv`, just reset; one that an earlier test has left is used again."""
     from bench_gripper import make_env
 
-    torch.set_num_threads(1)
-    made = []
+    free = {key: list(envs) for key, envs in _made.items()}
 
     def make(**kwargs: Any) -> Any:
-        made.append(make_env(**kwargs))
-        return made[-1]
+        key = tuple(sorted(kwargs.items()))
+        if free.get(key):
+            env = free[key].pop()
+            env.reset(seed=0)
+        else:
+            env = make_env(**kwargs)
+            _made.setdefault(key, []).append(env)
+        return env
 
-    yield make
-    for env in made:
-        env.close()
+    return make
