@@ -1,9 +1,16 @@
 """What holds for every test: one thread a process, MuJoCo's OpenGL, the order of the files, and who was at work."""
 
+from __future__ import annotations
+
 import os
 import signal
+from collections.abc import Callable
+from typing import TYPE_CHECKING
 
 import pytest
+
+if TYPE_CHECKING:
+    import gymnasium
 
 # Before torch is imported, here and in what the tests start: workers share the cores, and more threads fight over them.
 os.environ.setdefault("OMP_NUM_THREADS", "1")
@@ -29,6 +36,16 @@ LONGEST = (
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     """Put the long files first; the order within a file stays."""
     items.sort(key=lambda item: next((k for k, name in enumerate(LONGEST) if name in item.nodeid), len(LONGEST)))
+
+
+@pytest.fixture(scope="session")
+def keep_compiled() -> Callable[[gymnasium.Env], None]:
+    """Call it with an environment that draws with ManiSkill's shaders: what was compiled for them, in 7 s, stays.
+
+    Compiled shaders live as long as any renderer does; that of a closed environment is small.
+    """
+    kept = []
+    return lambda env: kept.append(env.unwrapped.scene.sub_scenes[0].render_system)
 
 
 class AtWork:

@@ -96,12 +96,13 @@ def test_state_matches_its_layout(task, env):
         assert torch.equal(state[:, slice(*task.SPEC.state_layout[f"{name}_pose"])], actor.pose.raw_pose)
 
 
-def test_made_by_its_id_alone(task):
+def test_made_by_its_id_alone(task, keep_compiled):
     """As a user of ManiSkill would, with its defaults for everything else."""
     env = gym.make(task.GYM_ID, num_envs=1, obs_mode="pointcloud")
     try:
         obs, _ = env.reset(seed=0)
         obs, reward, terminated, truncated, info = env.step(env.action_space.sample())
+        keep_compiled(env)
     finally:
         env.close()
     assert obs["pointcloud"]["xyzw"].shape == (1, 84 * 84, 4)

@@ -45,11 +45,13 @@ def expert_episode(env, seed, on_step=lambda *_: None, style=None):
 
 
 @pytest.mark.parametrize("obs_mode", ["state", "state_dict", "pointcloud", "rgbd"])
-def test_observation_modes(obs_mode):
+def test_observation_modes(obs_mode, keep_compiled):
     env = make(obs_mode=obs_mode, **SMALL)
     try:
         obs, _ = env.reset(seed=0)
         obs, reward, terminated, truncated, info = env.step(env.action_space.sample())
+        if obs_mode in ("pointcloud", "rgbd"):
+            keep_compiled(env)
     finally:
         env.close()
     assert reward.shape == terminated.shape == truncated.shape == info["success"].shape == (1,)
