@@ -27,6 +27,8 @@ LONGEST = (
     "demos/test_store.py",
     "envs/test_vec_env.py",
     "cli/test_cli.py",
+    "training/test_interruption.py",
+    "tasks/test_rewards.py",
     "benchmark/test_ray_cluster.py",
     "envs/test_mujoco_suites.py",
     "benchmark/test_benchmark_guide.py",
