@@ -158,6 +158,7 @@ FRAMES = sum(LENGTHS)
         ({}, {"env": "ur3e/slide-blok"}, UnknownNameError, "ur3e/slide-block"),
         ({}, {"colors": True}, ConfigError, "no colours"),
         ({}, {"num_points": 0}, ConfigError, "num_points"),
+        ({}, {"num_points": 99_999_999}, ConfigError, "--num-points 99999999 exceeds 7056: the clouds of .* have"),
         ({}, {"env": None, "frame": "camera"}, ConfigError, "camera"),
         ({}, {"env": None, "control_hz": 0.0}, ConfigError, "control_hz must be positive"),
         ({}, {"frame": "world"}, ConfigError, "leave them out"),

@@ -6,6 +6,7 @@ can be checked is checked; what cannot (frames, units, the meaning of entries) i
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -13,6 +14,7 @@ from typing import Any
 
 import numpy as np
 
+from manicm_ms.camera_model import CLOUD_SIZE
 from manicm_ms.demos.convert.base import IMPORTERS, Tally
 from manicm_ms.demos.convert.raw_store import OPTIONAL, RawStore
 from manicm_ms.demos.convert.scales import Scales, decide
@@ -144,9 +146,15 @@ class Reading:
 
 def _spec(raw: RawStore, asked: Dp3Options) -> EnvSpec:
     """Return the spec of the new store: the environment's, or one made of shapes; refuse data that does not fit it."""
-    channels = raw.arrays["point_cloud"].shape[2]
+    _, points, channels = raw.arrays["point_cloud"].shape
     if asked.colors and channels == 3:
         raise ConfigError(f"{raw.path} holds no colours: drop --colors")
+    most = max(points, math.prod(CLOUD_SIZE))
+    if asked.num_points is not None and asked.num_points > most:
+        raise ConfigError(
+            f"--num-points {asked.num_points} exceeds {most}: the clouds of {raw.path} have {points} points, "
+            f"of which a smaller number is kept, and a larger one made by repetition"
+        )
     spec = _spec_of_shapes(raw, asked) if asked.env is None else ENVS.get(asked.env).spec
     obs = replace(
         spec.obs,
