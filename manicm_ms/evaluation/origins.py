@@ -22,7 +22,8 @@ class Origin:
 
     Attributes:
         tasks: environment ids of its spec, of its demonstrations and of its teacher's, each once.
-        demo_seeds: environment id -> seeds of the demonstrations it learnt from, its teacher's included.
+        demo_seeds: environment id -> seeds of the demonstrations it learnt from, its teacher's included; none where
+            it learnt from some whose seeds are not known, as those of other people's stores.
         run: fingerprint of the training that made it.
         teacher_run: that of its teacher's training, where it was distilled.
     """
@@ -103,6 +104,11 @@ def remarks(contenders: Sequence[Contender], env_id: str, seeds: Sequence[int]) 
     lines = [
         f"{name}: {count} of the {len(seeds)} seeds are those of its own demonstrations: not a rate on fresh seeds."
         for name, count in seen_counts(distinct, env_id, seeds).items()
+    ]
+    lines += [
+        f"{c.name}: the seeds of its demonstrations are not known, so that some of these may be among them."
+        for c in distinct
+        if env_id in c.origin.demo_seeds and not c.origin.demo_seeds[env_id]
     ]
     for contender in distinct:
         if others := [task for task in contender.origin.tasks if task != env_id]:

@@ -50,6 +50,7 @@ def test_every_cell_is_there_with_its_episodes_and_evaluations(whole):
     for cell in found["cells"]:
         assert cell["n"] == 4
         assert cell["successes"] == sum(sum(won) for won in cell["outcomes"].values())
+        assert cell["success_once"] == cell["success_at_end"] == cell["outcomes"], "these tasks end at their success"
         assert cell["nfe"] == (10 if cell["method"] == "simple_dp3" else 1)
         assert cell["latency_ms"]["n"] > 0
         for evaluations in cell["evaluations"].values():

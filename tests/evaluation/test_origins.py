@@ -75,6 +75,14 @@ def test_seeds_of_the_demonstrations_are_refused_with_the_way_out():
     assert "2 of the 4 seeds are those of its own demonstrations" in remarks(policies, ENV, range(6, 10))[0]
 
 
+def test_demonstrations_of_unknown_seeds_are_told():
+    imported = contender("teacher", trained([-1, -2]))
+    require_unseen([imported], ENV, range(10))
+    (line,) = remarks([imported], ENV, range(10))
+    assert line.startswith("teacher: the seeds of its demonstrations are not known")
+    assert remarks([contender("teacher", {})], ENV, range(10)) == []
+
+
 def test_another_task_and_another_teacher_are_told():
     teacher = contender("teacher", trained([1], run="tt"))
     own = trained([1], teacher={"provenance": trained([1], run="tt")})
