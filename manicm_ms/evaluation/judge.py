@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import re
-import shlex
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
@@ -15,20 +14,13 @@ from rich.progress import Progress
 from manicm_ms.camera_model import CameraModel, read_camera
 from manicm_ms.devices import resolve_device, torch_threads
 from manicm_ms.errors import ConfigError, OutputExistsError
-from manicm_ms.evaluation.contenders import (
-    CONTROL,
-    STUDENT,
-    TEACHER,
-    Contender,
-    checkpoint_digest,
-    load_contenders,
-    require_made_for,
-)
+from manicm_ms.evaluation.contenders import Contender, load_contenders, require_made_for
 from manicm_ms.evaluation.latency import Latency, measure_latency
 from manicm_ms.evaluation.origins import remarks, require_unseen
 from manicm_ms.evaluation.protocol import CLEAN, Conditions, Protocol
 from manicm_ms.evaluation.records import EpisodeLog, claimed_folder
 from manicm_ms.evaluation.report import screen_lines, summary_tables, write_report
+from manicm_ms.evaluation.request import OBS_PRESET, command_of, request_of
 from manicm_ms.evaluation.results import compile_results, realism_entry
 from manicm_ms.evaluation.rollout import EpisodeResult, RestartableEnv, rollout
 from manicm_ms.evaluation.video import Take, choose_seeds, film
@@ -40,8 +32,6 @@ from manicm_ms.types import AGENT_POS, ChunkSpec, EnvSpec, require_compatible
 if TYPE_CHECKING:
     from manicm_ms.envs.vec_env import VecEnv
     from manicm_ms.policies.base import Policy
-
-OBS_PRESET = "manicm_ms"
 
 
 class EnvMaker(NamedTuple):
@@ -131,47 +121,11 @@ def evaluate(
     if not allow_seen_seeds:
         require_unseen(contenders, env_id, seeds)
     require_made_for(SimulatorConfig(obs_preset=obs_preset).specialise(entry.spec), contenders)
-    request = _request(protocol, contenders, backend, device, model, obs_preset)
+    request = request_of(protocol, contenders, backend, device, model, obs_preset)
     envs = env_maker(env_id, backend, model, obs_preset)
     flags = (["--allow-seen-seeds"] if allow_seen_seeds else []) + ([] if to_the_end else ["--no-to-the-end"])
-    command = command or _command(checkpoints, env_id, episodes, seed, out, realism, camera, obs_preset, flags)
+    command = command or command_of(checkpoints, env_id, episodes, seed, out, realism, camera, obs_preset, flags)
     return judge(contenders, protocol, envs, out, request, command, console or Console())
-
-
-def _request(
-    protocol: Protocol,
-    contenders: Sequence[Contender],
-    backend: str,
-    device: str,
-    camera: CameraModel | None,
-    obs_preset: str,
-) -> dict[str, Any]:
-    """Return what identifies an evaluation in its folder: an interrupted one goes on where all of it is the same."""
-    return {
-        "env_id": protocol.env_id,
-        "seed": protocol.seeds[0],
-        "episodes": len(protocol.seeds),
-        "backend": backend,
-        "device": device,
-        "policies": [[c.name, _place(i, c), checkpoint_digest(c.checkpoint)] for i, c in enumerate(contenders)],
-        **_requested_realism(protocol.realism, camera),
-        **({} if obs_preset == OBS_PRESET else {"obs_preset": obs_preset}),
-    }
-
-
-def _place(index: int, contender: Contender) -> str:
-    """Return what folders of all versions call the place of a policy in the list; its role is another matter."""
-    return CONTROL if contender.role == CONTROL else STUDENT if index else TEACHER
-
-
-def _requested_realism(presets: tuple[str, ...], camera: CameraModel | None) -> dict[str, Any]:
-    """Return what identifies presets and camera of an evaluation; nothing in the ideal world, as ever."""
-    requested: dict[str, Any] = {}
-    if presets != (CLEAN,):
-        requested["realism"] = [[name, REALISM.get(name).to_dict()] for name in presets]
-    if camera is not None:
-        requested["camera"] = camera.to_dict()
-    return requested
 
 
 def env_maker(env_id: str, backend: str, camera: CameraModel | None = None, obs_preset: str = OBS_PRESET) -> EnvMaker:
@@ -422,21 +376,3 @@ def _progress(console: Console) -> Progress:
 def slug(name: str) -> str:
     """Return `name` as a file name."""
     return re.sub(r"[^\w-]+", "-", name).strip("-")
-
-
-def _command(
-    checkpoints: Sequence[Path],
-    env_id: str,
-    episodes: int,
-    seed: int,
-    out: Path,
-    realism: str,
-    camera: Path | None,
-    obs_preset: str,
-    flags: Sequence[str],
-) -> str:
-    words = ["manicm-ms", "evaluate", *map(str, checkpoints), "--env", env_id]
-    words += ["--obs-preset", obs_preset] if obs_preset != OBS_PRESET else []
-    words += ["--realism", realism] if realism != CLEAN else []
-    words += ["--camera", str(camera)] if camera is not None else []
-    return shlex.join([*words, "--episodes", str(episodes), "--seed", str(seed), "--out", str(out), *flags])

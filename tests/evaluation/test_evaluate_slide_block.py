@@ -11,8 +11,9 @@ from rich.console import Console
 from manicm_ms.envs.simulator import ENVS
 from manicm_ms.errors import CheckpointError, ConfigError, SpecMismatchError, UnknownNameError
 from manicm_ms.evaluation.contenders import checkpoint_digest, load_contenders
-from manicm_ms.evaluation.judge import OBS_PRESET, _request, evaluate
+from manicm_ms.evaluation.judge import evaluate
 from manicm_ms.evaluation.protocol import Protocol
+from manicm_ms.evaluation.request import OBS_PRESET, request_of
 from manicm_ms.policies.base import make_policy
 from manicm_ms.policies.checkpoint import save_checkpoint
 from manicm_ms.policies.manicm import ManiCM
@@ -82,7 +83,7 @@ def test_the_role_is_the_checkpoints_own(pair):
 def test_an_evaluation_that_an_earlier_version_began_goes_on(pair):
     def identified(checkpoints):
         protocol = Protocol(ENV, (5, 6), num_envs=1)
-        return _request(protocol, load_contenders(checkpoints), "cpu", "cpu", None, OBS_PRESET)
+        return request_of(protocol, load_contenders(checkpoints), "cpu", "cpu", None, OBS_PRESET)
 
     teacher, student = (checkpoint_digest(str(path)) for path in pair)
     earlier = {"env_id": ENV, "seed": 5, "episodes": 2, "backend": "cpu", "device": "cpu"}

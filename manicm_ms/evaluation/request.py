@@ -1,0 +1,70 @@
+"""What identifies an evaluation in its folder, and the command line that asks for it."""
+
+from __future__ import annotations
+
+import shlex
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+from manicm_ms.camera_model import CameraModel
+from manicm_ms.evaluation.contenders import CONTROL, STUDENT, TEACHER, Contender, checkpoint_digest
+from manicm_ms.evaluation.protocol import CLEAN, Protocol
+from manicm_ms.realism import REALISM
+
+OBS_PRESET = "manicm_ms"
+
+
+def request_of(
+    protocol: Protocol,
+    contenders: Sequence[Contender],
+    backend: str,
+    device: str,
+    camera: CameraModel | None,
+    obs_preset: str,
+) -> dict[str, Any]:
+    """Return what identifies an evaluation in its folder: an interrupted one goes on where all of it is the same."""
+    return {
+        "env_id": protocol.env_id,
+        "seed": protocol.seeds[0],
+        "episodes": len(protocol.seeds),
+        "backend": backend,
+        "device": device,
+        "policies": [[c.name, _place(i, c), checkpoint_digest(c.checkpoint)] for i, c in enumerate(contenders)],
+        **_requested_realism(protocol.realism, camera),
+        **({} if obs_preset == OBS_PRESET else {"obs_preset": obs_preset}),
+    }
+
+
+def _place(index: int, contender: Contender) -> str:
+    """Return what folders of all versions call the place of a policy in the list; its role is another matter."""
+    return CONTROL if contender.role == CONTROL else STUDENT if index else TEACHER
+
+
+def _requested_realism(presets: tuple[str, ...], camera: CameraModel | None) -> dict[str, Any]:
+    """Return what identifies presets and camera of an evaluation; nothing in the ideal world, as ever."""
+    requested: dict[str, Any] = {}
+    if presets != (CLEAN,):
+        requested["realism"] = [[name, REALISM.get(name).to_dict()] for name in presets]
+    if camera is not None:
+        requested["camera"] = camera.to_dict()
+    return requested
+
+
+def command_of(
+    checkpoints: Sequence[Path],
+    env_id: str,
+    episodes: int,
+    seed: int,
+    out: Path,
+    realism: str,
+    camera: Path | None,
+    obs_preset: str,
+    flags: Sequence[str],
+) -> str:
+    """Return the command line of `evaluate` with these arguments; those left at their default are left out."""
+    words = ["manicm-ms", "evaluate", *map(str, checkpoints), "--env", env_id]
+    words += ["--obs-preset", obs_preset] if obs_preset != OBS_PRESET else []
+    words += ["--realism", realism] if realism != CLEAN else []
+    words += ["--camera", str(camera)] if camera is not None else []
+    return shlex.join([*words, "--episodes", str(episodes), "--seed", str(seed), "--out", str(out), *flags])
