@@ -12,6 +12,7 @@ import manicm_ms.envs.maniskill  # noqa: F401  (chooses the Vulkan driver before
 from manicm_ms.tasks import stack_cube  # isort: skip
 
 from manicm_ms.demos.experts import EXPERTS
+from manicm_ms.robots import memory
 from manicm_ms.robots.controllers import LimitedPoseController, OpeningController
 
 N = 4
@@ -98,3 +99,31 @@ def test_the_expert_succeeds_with_the_batched_ik_that_a_gpu_would_use(env):
             break
     assert info["success"].item()
     assert worst < 5e-3, "the joints' targets follow the tool's target"
+
+
+# ---- memory ---------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(("controller_class", "joints"), [(LimitedPoseController, 6), (OpeningController, 2)])
+def test_memory_is_taken_back_in_the_marked_rows_as_a_copy(controller_class, joints):
+    controller = rows_of(controller_class, joints)
+    driven = []
+    controller.joints = controller.articulation.set_joint_drive_targets = lambda targets, *_: driven.append(targets)
+    told = memory.of(controller)
+    wanted = {name: values[:2] + 1 for name, values in told.items()}
+    controller.scene._reset_mask = torch.tensor([True, False, True, False])
+    controller.beginning = torch.ones(N, dtype=torch.bool)
+    memory.restore(controller, wanted)
+    now = memory.of(controller)
+    for name, values in told.items():
+        assert torch.equal(now[name][[0, 2]], wanted[name])
+        assert torch.equal(now[name][[1, 3]], values[[1, 3]])
+        wanted[name].zero_()  # what was given and what is told are nobody's live tensor
+        now[name].zero_()
+        assert memory.of(controller)[name].abs().sum() > 0
+    assert torch.equal(driven[-1], controller._target_qpos)
+    controller.scene._reset_mask = torch.ones(N, dtype=torch.bool)
+    controller.reset()  # in the middle of an environment's reset: the restored rows do not begin
+    measured = controller.articulation.get_qpos()
+    assert torch.equal(controller._target_qpos[[1, 3]], measured[[1, 3]])
+    assert not torch.equal(controller._target_qpos[[0, 2]], measured[[0, 2]])
