@@ -111,7 +111,9 @@ DAMAGES = {
 
 
 @pytest.mark.parametrize("kind", DAMAGES)
-def test_damage_is_named(sound, tmp_path, capsys, kind):
+def test_damage_is_named(sound, tmp_path, capsys, monkeypatch, kind):
+    monkeypatch.setattr("manicm_ms.demos.inspect._MOST_EPISODES", 1)  # pictures are most of a page's work
+    monkeypatch.setattr("manicm_ms.demos.inspect._STRIP_FRAMES", 2)
     damage, named = DAMAGES[kind]
     path = tmp_path / "a.zarr"
     shutil.copytree(sound, path)
