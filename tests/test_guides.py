@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 import tyro
 
-from manicm_ms.cli import _PLAIN, _WITH_PRESET, PROGRAM, _training_command
+from manicm_ms.cli import _PLAIN, _WITH_PRESET, PROGRAM, _command
 
 REPO = Path(__file__).parents[1]
 PAGES = [REPO / "README.md", *sorted((REPO / "docs").rglob("*.md"))]
@@ -39,7 +39,7 @@ DOCUMENTED = [
 def parse(words):
     """Parse a command line as the program does, and run nothing; a bad one ends in SystemExit."""
     name, rest = words[0], [PLACEHOLDERS.get(word, word) for word in words[1:]]
-    command = _training_command(name, rest) if name in _WITH_PRESET else _PLAIN[name]
+    command = _command(name, rest)
 
     @functools.wraps(command)
     def accept(*args, **kwargs):
