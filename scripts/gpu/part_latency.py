@@ -142,7 +142,10 @@ class Eager:
 
 
 class Recorded(Eager):
-    """The same decision from buffers that stay where they are, its kernels recorded once and replayed together."""
+    """The same decision from buffers that stay where they are, its kernels recorded once and replayed together.
+
+    Policies leave out their checks for NaN while a graph is recorded: a check waits for the device.
+    """
 
     def __init__(self, policy: Policy, obs: Mapping[str, Tensor]) -> None:
         super().__init__(policy, obs)
