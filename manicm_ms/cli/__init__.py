@@ -277,7 +277,7 @@ def benchmark_command(
 ) -> int:
     """Run the grid task x method x seed and write the paper's main table; any number of these may run at once.
 
-    Each job (collect, train or distil, judge) goes on where it was stopped when the same command is given again.
+    Each job (collect, train or distil, evaluate) goes on where it was stopped when the same command is given again.
 
     Args:
         envs: environment ids and tags, separated by commas; 'manicm-ms list envs' shows both.

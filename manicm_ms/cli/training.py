@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Annotated
@@ -10,7 +11,7 @@ import tyro
 
 from manicm_ms.cli import this_command
 from manicm_ms.cli.counts import Seed
-from manicm_ms.errors import ConfigError
+from manicm_ms.errors import ConfigError, ManicmWarning
 from manicm_ms.training.presets import STUDENT_PRESETS, TEACHER_PRESETS, StudentPreset, TeacherPreset
 
 DEFAULT_PRESET = "quick"
@@ -42,8 +43,7 @@ def train_command(arguments: Sequence[str]) -> Callable[..., None]:
         """
         from manicm_ms.training.teacher import train_teacher
 
-        if recipe.points != default.points:
-            _require_points(recipe.points, data)
+        _check_points(recipe, default, data)
         train_teacher(policy, data, out, recipe, device=device, seed=seed, command=this_command())
 
     return train
@@ -85,19 +85,26 @@ def distill_command(arguments: Sequence[str]) -> Callable[..., None]:
     return distill
 
 
-def _require_points(points: int | None, data: Path) -> None:
+def _check_points(recipe: TeacherPreset, default: TeacherPreset, data: Path) -> None:
     """Raise ConfigError where more points are asked for than the clouds of the store have.
 
-    A preset's own number is no such request: of smaller clouds it means all points.
+    A preset's own number is no such request: of smaller clouds all points are read, which a warning says.
     """
     from manicm_ms.demos.store import DemoStore
 
     with DemoStore.open(data) as store:
         stored = store.spec.obs.num_points
-    if points is not None and points > stored:
+    if recipe.points is None or recipe.points <= stored:
+        return
+    if recipe.points != default.points:
         raise ConfigError(
-            f"--points {points} exceeds the {stored} points of each cloud in {data}: give {stored} or less"
+            f"--points {recipe.points} exceeds the {stored} points of each cloud in {data}: give {stored} or less"
         )
+    warnings.warn(
+        f"the clouds in {data} have {stored} points: all are read, where the preset names {recipe.points}",
+        ManicmWarning,
+        stacklevel=2,
+    )
 
 
 def _preset_asked(arguments: Sequence[str]) -> str:

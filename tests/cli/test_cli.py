@@ -139,7 +139,7 @@ def test_unknown_command_in_a_real_process():
     [
         ("train dp3 --data DATA --out OUT --preset quik", "unknown teacher preset 'quik': did you mean 'quick'?"),
         ("distill --teacher T --data DATA --out OUT --preset=papr", "'papr': did you mean 'paper'?"),
-        ("train dp33 --data DATA --out OUT", "unknown teacher policy 'dp33': did you mean 'dp3'?"),
+        ("train dp33 --data DATA --out OUT --preset smoke", "unknown teacher policy 'dp33': did you mean 'dp3'?"),
         ("collect ur3e/slide-blok --out OUT", "'ur3e/slide-blok': did you mean 'ur3e/slide-block'?"),
         ("collect button-press-v2", "unknown env id 'button-press-v2': it is called 'metaworld/button-press' here"),
         ("collect metaworld/hamer", "did you mean 'metaworld/hammer'?"),
@@ -320,3 +320,9 @@ def test_more_points_than_the_clouds_have_are_refused(told, demos, tmp_path):
     result = told("train", "dp3", "--data", demos, "--out", tmp_path / "out", "--points", 65)
     assert_one_line(result, "--points 65 exceeds the 64 points of each cloud", "reach.zarr", "give 64 or less")
     assert not (tmp_path / "out").exists()
+    small = TINY.replace("--points 8 ", "").replace(f"--steps {STEPS}", "--steps 3")
+    status, _, err = told("train", "simple_dp3", "--data", demos, "--out", tmp_path / "out", *small.split())
+    assert status == 0
+    told_of = [line for line in err.splitlines() if line.startswith("manicm-ms: warning: ")]
+    assert len(told_of) == 1
+    assert told_of[0].endswith("reach.zarr have 64 points: all are read, where the preset names 128")
