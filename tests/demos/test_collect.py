@@ -192,7 +192,7 @@ def test_kill_9_loses_and_doubles_nothing(reference, tmp_path):
         process = collect_process(out)
         while committed(out) < goal:
             assert process.poll() is None, process.communicate()[0].decode()
-            time.sleep(0.02)  # looking opens the store, which costs the process that is looked at
+            time.sleep(0.05)  # looking opens the store, which costs the process that is looked at
         time.sleep(rng.uniform(0, 0.03))  # anywhere within the next episode or its writing
         os.kill(process.pid, signal.SIGKILL)
         assert process.wait() == -signal.SIGKILL
