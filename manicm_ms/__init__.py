@@ -8,7 +8,11 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Any
 
-from manicm_ms import gym_ids
+from manicm_ms import signals
+
+signals.quiet_start("manicm-ms", "manicm_ms.cli")  # before the imports, in which an interrupt can get lost
+
+from manicm_ms import gym_ids  # noqa: E402
 
 __version__ = "0.1.0"
 __all__ = ["__version__", "check_vec_env", "make_vec"]

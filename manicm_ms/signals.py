@@ -14,6 +14,7 @@ import sys
 import threading
 import time
 from collections.abc import Iterator
+from itertools import pairwise
 from types import FrameType
 from typing import Any
 
@@ -110,17 +111,23 @@ def end_processes(processes: list[Any], patience_s: float = _END_S) -> None:
 _program = False  # whether this process runs one of ours, so that signals are ours to answer
 
 
-def quiet_start(programs: tuple[str, ...]) -> None:
+def quiet_start(command: str, module: str) -> None:
     """From here on, end with one word where a signal stops this process while it still imports what it needs.
 
-    Does nothing unless the command that runs is one of `programs`: a library must leave signals alone. Nor does it in a
-    worker process, which imports the same modules under the same name.
+    Does nothing unless the program that runs is `command`, or `python -m module`: a library must leave signals alone.
+    Nor does it in a worker process, which imports the same modules under the same name.
     """
     global _program
-    if os.path.basename(sys.argv[0]) in programs and not _is_child():
+    if _runs(command, module) and not _is_child():
         _program = True
         for number in _answered():
             signal.signal(number, _end_at_once)
+
+
+def _runs(command: str, module: str) -> bool:
+    if sys.argv[0] == "-m":  # so it stands while Python imports the packages of the module that it shall run
+        return ("-m", module) in pairwise(sys.orig_argv)
+    return os.path.basename(sys.argv[0]) == command
 
 
 @contextlib.contextmanager

@@ -21,7 +21,7 @@ BASE = {
 # layer -> the parts of manicm_ms that it may import beside itself and the base
 ALLOWED = {
     **{name: set() for name in BASE},
-    "__init__": {"envs", "gym_ids"},  # envs lazily: make_vec and check_vec_env
+    "__init__": {"envs", "gym_ids", "signals"},  # envs lazily: make_vec and check_vec_env
     "gym_ids": set(),
     "assets": set(),
     "calibration": set(),

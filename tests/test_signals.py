@@ -167,19 +167,44 @@ def test_children_inherit_that_ctrl_c_passes_them_by():
             child.communicate(b"\n")
 
 
-def test_importing_the_command_line_leaves_signals_alone_but_in_the_command():
-    look = "import signal, manicm_ms.cli; print(signal.getsignal(signal.SIGINT).__name__)"
-    for name, handler in (("pytest", "default_int_handler"), ("manicm-ms", "_end_at_once")):
-        code = f"import sys; sys.argv[0] = '/usr/bin/{name}'; {look}"
-        done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
-        assert done.stdout.strip() == handler
+LOOK = "print(signal.getsignal(signal.SIGINT).__name__)"
+
+
+def told(*words, **options):
+    """Return the last word that a Python process prints."""
+    done = subprocess.run([sys.executable, *words], capture_output=True, text=True, check=True, **options)
+    return done.stdout.split()[-1]
+
+
+@pytest.mark.parametrize(("name", "handler"), [("pytest", "default_int_handler"), ("manicm-ms", "_end_at_once")])
+def test_importing_the_package_leaves_signals_alone_but_in_the_command(name, handler):
+    """In the command they are answered before Gymnasium is imported: compiled imports can lose an interrupt."""
+    code = f"""if True:
+        import signal, sys
+        sys.argv[0] = "/usr/bin/{name}"
+        class Watch:
+            def find_spec(name, path, target=None):
+                if name == "gymnasium":
+                    {LOOK}
+        sys.meta_path.insert(0, Watch)
+        import manicm_ms
+    """
+    assert told("-c", code) == handler
+
+
+def test_a_module_of_the_users_that_imports_the_package_keeps_its_signals(tmp_path):
+    package = tmp_path / "theirs"
+    package.mkdir()
+    (package / "__init__.py").write_text("import manicm_ms\n")
+    (package / "work.py").write_text(f"import signal\n{LOOK}\n")
+    assert told("-m", "theirs.work", cwd=tmp_path) == "default_int_handler"
 
 
 PARENT = """
 import multiprocessing, sys, time
 sys.argv = ["manicm-ms"]
 from manicm_ms import signals
-signals.quiet_start(("manicm-ms",))
+signals.quiet_start("manicm-ms", "manicm_ms.cli")
 def work(begun):
     begun.set()
     time.sleep(60)

@@ -6,11 +6,6 @@ were stopped when the same command is given again.
 
 from __future__ import annotations
 
-from manicm_ms import signals
-
-signals.quiet_start(("manicm-ms", "-m"))  # before the imports, which take a while
-
-# ruff: noqa: E402
 import errno
 import shlex
 import sys
@@ -21,6 +16,7 @@ from typing import Annotated, Any, Literal
 
 import tyro
 
+from manicm_ms import signals
 from manicm_ms.cli.counts import AtLeast, Count, CountOrNone, OptionalCount, Seed, checked
 from manicm_ms.cli.messages import PROGRAM, warnings_in_one_line
 from manicm_ms.errors import ConfigError, ManicmError, UnknownNameError
