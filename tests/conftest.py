@@ -72,6 +72,7 @@ class AtWork:
 
 def pytest_configure(config: pytest.Config) -> None:
     """Watch the tests from the process that tells of them; let it tell of them also where a time limit ends it."""
+    _start_children_as_a_terminal_does()
     if not hasattr(config, "workerinput"):
         config.pluginmanager.register(AtWork(), "at_work")
         signal.signal(signal.SIGTERM, _stop)
@@ -80,3 +81,11 @@ def pytest_configure(config: pytest.Config) -> None:
 def _stop(number: int, frame: object) -> None:
     signal.signal(number, signal.SIG_IGN)  # `timeout` sends it twice, and the second would cut off the telling
     raise KeyboardInterrupt
+
+
+def _start_children_as_a_terminal_does() -> None:
+    """Handle signals that a run in the background (`nohup`, `&`) ignores, since what the tests start inherits that."""
+    handlers = {signal.SIGINT: signal.default_int_handler, signal.SIGHUP: lambda number, frame: None}
+    for number, handler in handlers.items():
+        if signal.getsignal(number) is signal.SIG_IGN:
+            signal.signal(number, handler)
