@@ -72,8 +72,7 @@ def evaluate(
 ) -> dict[str, Any]:
     """Evaluate checkpoints on the same `episodes` fresh seeds and write results.json, report.md and report.html.
 
-    The same call goes on where an earlier one was stopped, by Ctrl-C or by a kill: finished episodes are
-    on disk and are not played again.
+    The same call goes on where an earlier one was stopped: finished episodes are on disk and are not played again.
 
     Args:
         checkpoints: checkpoint folders, the teacher first and the student last; one alone is evaluated without a pair.
@@ -92,26 +91,19 @@ def evaluate(
         camera: YAML file of the cell's depth camera, as in `make_vec`.
         obs_preset: as in `make_vec`; the one of the demonstrations that the policies learnt from.
         allow_seen_seeds: evaluate on seeds of a checkpoint's own demonstrations and say so; refused otherwise.
-        to_the_end: play on after a success that is certain, where the environment does, so that success at the end is
-            known; without it such episodes end at their success, which saves time.
+        to_the_end: play on after a success that is certain, so that success at the end is known; False saves time.
         command: the command line to print in the report; None writes the equivalent of this call.
         console: where progress and table are printed; None is standard output.
 
-    Returns:
-        What results.json holds.
+    Returns what results.json holds.
 
-    Raises:
-        UnknownNameError, CheckpointError, SpecMismatchError, ConfigError, CameraError, OutputExistsError,
-        NoSpaceError, BackendError.
+    Raises ManicmError: an unknown name, a checkpoint that does not fit, another evaluation in `out`, a full disk.
     """
     from manicm_ms.envs.simulator import ENVS, SimulatorConfig
-    from manicm_ms.envs.vec_env import default_num_envs, resolve_backend
+    from manicm_ms.envs.vec_env import resolve_backend
 
-    if episodes < 1:
-        raise ConfigError(f"--episodes must be at least 1, got {episodes}")
-    seeds, presets = tuple(range(seed, seed + episodes)), parse_presets(realism)
-    rows = min(default_num_envs() if num_envs is None else num_envs, episodes)
-    entry = ENVS.get(env_id)
+    entry, seeds, presets = ENVS.get(env_id), tuple(range(seed, seed + episodes)), parse_presets(realism)
+    rows = _rows(num_envs, episodes)
     protocol = Protocol(env_id, seeds, rows, threads, repetitions, videos, presets, to_the_end, entry.seed_limit)
     model = None if camera is None else read_camera(camera)
     backend = resolve_backend(backend, entry)
@@ -122,10 +114,18 @@ def evaluate(
         require_unseen(contenders, env_id, seeds)
     require_made_for(SimulatorConfig(obs_preset=obs_preset).specialise(entry.spec), contenders)
     request = request_of(protocol, contenders, backend, device, model, obs_preset)
-    envs = env_maker(env_id, backend, model, obs_preset)
-    flags = (["--allow-seen-seeds"] if allow_seen_seeds else []) + ([] if to_the_end else ["--no-to-the-end"])
-    command = command or command_of(checkpoints, env_id, episodes, seed, out, realism, camera, obs_preset, flags)
-    return judge(contenders, protocol, envs, out, request, command, console or Console())
+    asked = (checkpoints, env_id, episodes, seed, out, realism, camera, obs_preset, allow_seen_seeds, to_the_end)
+    makers = env_maker(env_id, backend, model, obs_preset)
+    return judge(contenders, protocol, makers, out, request, command or command_of(*asked), console or Console())
+
+
+def _rows(num_envs: int | None, episodes: int) -> int:
+    """Return how many rows play at once; raise ConfigError where there is no episode to play."""
+    from manicm_ms.envs.vec_env import default_num_envs
+
+    if episodes < 1:
+        raise ConfigError(f"--episodes must be at least 1, got {episodes}")
+    return min(default_num_envs() if num_envs is None else num_envs, episodes)
 
 
 def env_maker(env_id: str, backend: str, camera: CameraModel | None = None, obs_preset: str = OBS_PRESET) -> EnvMaker:

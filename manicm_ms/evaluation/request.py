@@ -60,9 +60,11 @@ def command_of(
     realism: str,
     camera: Path | None,
     obs_preset: str,
-    flags: Sequence[str],
+    allow_seen_seeds: bool,
+    to_the_end: bool,
 ) -> str:
     """Return the command line of `evaluate` with these arguments; those left at their default are left out."""
+    flags = (["--allow-seen-seeds"] if allow_seen_seeds else []) + ([] if to_the_end else ["--no-to-the-end"])
     words = ["manicm-ms", "evaluate", *map(str, checkpoints), "--env", env_id]
     words += ["--obs-preset", obs_preset] if obs_preset != OBS_PRESET else []
     words += ["--realism", realism] if realism != CLEAN else []

@@ -64,9 +64,7 @@ def distill(
     """
     require_seed(seed)
     teacher, objective_type = Path(teacher), DISTILLATIONS.get(preset.objective)
-    policy = load_checkpoint(teacher)
-    if not isinstance(policy, DiffusionPolicy):
-        raise CheckpointError(f"{teacher} holds a {policy.name}, which cannot be distilled: give a diffusion teacher")
+    policy = _load_teacher(teacher)
     demos = read_demos(data, policy.chunk)
     require_compatible(demos.spec, policy.spec, f"the data {data}", f"the teacher {teacher}")
     if not allow_other_task:
@@ -74,16 +72,9 @@ def distill(
     student = ManiCM.from_teacher(policy, nfe=preset.nfe, num_solver_steps=_solver_steps(policy, preset.skip))
     manifest = read_manifest(teacher)
     session = Session.start(
-        "student",
-        out,
-        preset,
-        device=device,
-        precision=precision or preset.precision,
-        seed=seed,
-        num_devices=num_devices,
-        console=console,
-        command=command,
-    )
+        "student", out, preset, device=device, precision=precision or preset.precision, seed=seed,
+        num_devices=num_devices, console=console, command=command,
+    )  # fmt: skip
     session.show_remarks(demos)
 
     def build() -> tuple[PolicyObjective, Batches]:
@@ -97,6 +88,13 @@ def distill(
     inputs = {"teacher": weights, "data": demos.provenance["sha256"]}
     made_from = {"path": str(teacher), "sha256": weights, "provenance": manifest["provenance"]}
     return session.complete(inputs, {"data": demos.provenance, "teacher": made_from}, build, snapshots)
+
+
+def _load_teacher(folder: Path) -> DiffusionPolicy:
+    policy = load_checkpoint(folder)
+    if not isinstance(policy, DiffusionPolicy):
+        raise CheckpointError(f"{folder} holds a {policy.name}, which cannot be distilled: give a diffusion teacher")
+    return policy
 
 
 def _require_same_task(demonstrated: EnvSpec, data: Path, learnt: EnvSpec, teacher: Path) -> None:
