@@ -8,11 +8,12 @@ from typing import Any, NamedTuple
 
 from rich.table import Table
 
+from manicm_ms.benchmark.summary import PAPER_GROUPS
 from manicm_ms.evaluation.report import format_ms, template
 from manicm_ms.evaluation.resampling import MANY_TRAININGS, RECIPE
 from manicm_ms.paths import write_json, write_text
 
-_PAPER_COLUMNS = ("adroit", "easy", "medium", "hard", "very-hard", "average", "ms")
+_PAPER_COLUMNS = (*PAPER_GROUPS, "average", "ms")
 PAPER: Mapping[str, Mapping[str, float]] = {
     method: dict(zip(_PAPER_COLUMNS, figures, strict=True))
     for method, figures in {
@@ -96,8 +97,8 @@ def _marked(entry: Mapping[str, Any] | None, shown: Callable[[Mapping[str, Any]]
 
 def paper_table(results: Mapping[str, Any]) -> TextTable | None:
     """Return the paper's own figures of the methods that it has, for the groups that the benchmark has."""
-    groups = list(dict.fromkeys(cell["group"] for cell in results["cells"]))
-    known = [name for name in groups if name in PAPER["dp3"]]
+    groups = {cell["group"] for cell in results["cells"]}
+    known = [name for name in PAPER_GROUPS if name in groups]
     methods = [row["method"] for row in results["rows"] if row["method"] in PAPER]
     if not known or not methods:
         return None

@@ -2,6 +2,8 @@
 
 import dataclasses
 import json
+import subprocess
+import sys
 from pathlib import Path
 
 import numpy as np
@@ -83,6 +85,19 @@ def results(tmp_path_factory):
 
 def row(results, method):
     return next(r for r in results["rows"] if r["method"] == method)
+
+
+def test_groups_stand_in_the_papers_order_whichever_file_of_tasks_is_imported_first():
+    code = (
+        "import manicm_ms.tasks.metaworld\n"
+        "from manicm_ms.envs.simulator import ENVS\n"
+        "from manicm_ms.benchmark import summary\n"
+        "assert [n for n in ENVS.names() if '/' in n][0].startswith('metaworld')\n"
+        "ids = ('metaworld/reach', 'adroit/door', 'ur3e/slide-block', 'metaworld/soccer')\n"
+        "print(*sorted((summary.group_of(i) for i in ids), key=lambda g: summary._order({'group': g})))\n"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert done.stdout.split() == ["adroit", "easy", "medium", "ur3e"]
 
 
 def test_groups_and_average_are_means_over_tasks(results):
