@@ -12,7 +12,7 @@ from manicm_ms import signals
 
 signals.quiet_start("manicm-ms", "manicm_ms.cli")  # before the imports, in which an interrupt can get lost
 
-from manicm_ms import gym_ids  # noqa: E402
+from manicm_ms import former_names, gym_ids  # noqa: E402
 
 __version__ = "0.1.0"
 __all__ = ["__version__", "check_vec_env", "make_vec"]
@@ -32,4 +32,5 @@ def __getattr__(name: str) -> Any:
     return getattr(importlib.import_module(_LAZY[name]), name)
 
 
+former_names.install()
 gym_ids.register()

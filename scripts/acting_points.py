@@ -10,10 +10,10 @@ from pathlib import Path
 
 import tyro
 
-from manicm_ms.devices import torch_threads
 from manicm_ms.envs.vec_env import VecEnv, default_num_envs, make_vec
 from manicm_ms.evaluation.rollout import RestartableEnv, rollout
 from manicm_ms.evaluation.statistics import compare_paired, success_rate
+from manicm_ms.machine.devices import torch_threads
 from manicm_ms.policies.checkpoint import load_checkpoint
 from manicm_ms.policies.diffusion import DiffusionPolicy, OneStepTeacher
 from manicm_ms.policies.manicm import ManiCM

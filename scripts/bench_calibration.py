@@ -20,11 +20,11 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "tests" / "calibrat
 from rendered_board import Studio, tool_poses
 from synthetic_views import TRUTH, error, nudge
 
-from manicm_ms.calibration import CharucoSpec, solve_views
-from manicm_ms.calibration.board import detect
-from manicm_ms.calibration.hand_eye import Pinhole, View
-from manicm_ms.camera_model import Crop, default_camera
 from manicm_ms.errors import CalibrationError
+from manicm_ms.sensing.calibration import CharucoSpec, solve_views
+from manicm_ms.sensing.calibration.board import detect
+from manicm_ms.sensing.calibration.hand_eye import Pinhole, View
+from manicm_ms.sensing.camera_model import Crop, default_camera
 
 VIEWS, SEEDS = 14, 3
 STREAMS = {

@@ -17,10 +17,10 @@ import torch
 import tyro
 from torch import Tensor
 
-from manicm_ms.camera_model import CameraModel, default_camera, depth_to_cloud
 from manicm_ms.paths import write_text
-from manicm_ms.point_cloud import Box
-from manicm_ms.stereo_depth import StereoDepth
+from manicm_ms.sensing.camera_model import CameraModel, default_camera, depth_to_cloud
+from manicm_ms.sensing.point_cloud import Box
+from manicm_ms.sensing.stereo_depth import StereoDepth
 
 OUT = Path(__file__).resolve().parents[1] / "docs" / "results" / "depth_camera.md"
 WORKSPACE = Box((0.15, -0.25, 0.003), (0.50, 0.25, 0.15))  # of the UR3e tasks

@@ -21,7 +21,7 @@ import numpy as np
 import psutil
 import torch
 
-from manicm_ms import vulkan
+from manicm_ms.machine import vulkan
 
 vulkan.prepare()  # before SAPIEN is first imported
 

@@ -29,7 +29,7 @@ from manicm_ms.envs.simulator import ENVS, SimulatorConfig
 from manicm_ms.errors import ConfigError, ManicmError
 from manicm_ms.evaluation.intervals import rate_interval
 from manicm_ms.robots.ur3e_ag95 import ARM_JOINTS, JOINT_EFFORT, JOINT_SPEED
-from manicm_ms.types import STATE
+from manicm_ms.spec import STATE
 
 OUT = Path(__file__).resolve().parents[1] / "docs" / "results" / "expert.md"
 TAG = "real-robot"

@@ -22,7 +22,7 @@ from manicm_ms.evaluation.machine import machine
 from manicm_ms.paths import write_text
 from manicm_ms.policies.base import Policy, make_policy
 from manicm_ms.policies.manicm import ManiCM
-from manicm_ms.types import ActionSpec, ChunkSpec, EnvSpec, ObsSpec
+from manicm_ms.spec import ActionSpec, ChunkSpec, EnvSpec, ObsSpec
 
 CHUNK = ChunkSpec(n_obs_steps=2, horizon=4, n_action_steps=3)
 TEACHERS = {"DP3": "dp3", "Simple DP3": "simple_dp3"}

@@ -19,8 +19,8 @@ import tyro
 from manicm_ms.demos.experts import EXPERTS
 from manicm_ms.envs.simulator import ENVS, Simulator, SimulatorConfig
 from manicm_ms.paths import write_text
-from manicm_ms.realism import REALISM
-from manicm_ms.types import AGENT_POS, POINT_CLOUD, STATE
+from manicm_ms.sensing.realism import REALISM
+from manicm_ms.spec import AGENT_POS, POINT_CLOUD, STATE
 
 OUT = Path(__file__).resolve().parents[1] / "docs" / "results" / "realism.md"
 

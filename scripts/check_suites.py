@@ -17,7 +17,7 @@ import torch
 
 from manicm_ms.envs.conformance import check_vec_env
 from manicm_ms.envs.simulator import ENVS, SimulatorConfig
-from manicm_ms.types import AGENT_POS, POINT_CLOUD
+from manicm_ms.spec import AGENT_POS, POINT_CLOUD
 
 PAGE = Path(__file__).resolve().parents[1] / "docs" / "results" / "suites.md"
 BEGIN, END = "<!-- table: scripts/check_suites.py -->", "<!-- end of table -->"

@@ -15,7 +15,7 @@ from PIL import Image
 
 from manicm_ms.demos.experts import EXPERTS
 from manicm_ms.envs.vec_env import VecEnv, make_vec
-from manicm_ms.types import AGENT_POS, STATE
+from manicm_ms.spec import AGENT_POS, STATE
 
 EVERY = 2  # control steps a frame: 10 frames a second at 20 Hz
 HOLD_FRAMES = 8  # of the last picture of an episode

@@ -5,8 +5,8 @@ The first that renders is taken:
 1. The system's OpenGL: nothing is installed.
 2. An earlier run's choice in `.mujoco_gl/`.
 3. root with apt: the packages are installed.
-4. no root, with apt: they are downloaded and unpacked into `.mujoco_gl/`, which `manicm_ms.mujoco_gl` finds; nothing
-   outside the repository is written.
+4. no root, with apt: they are downloaded and unpacked into `.mujoco_gl/`, which
+   `manicm_ms.machine.mujoco_gl` finds; nothing outside the repository is written.
 
 Each is tried by a real rendering. Only Adroit and Meta-World need it, so a machine that cannot have it is told so and
 set up without it. Only the standard library is used.
@@ -120,7 +120,7 @@ def newest_mesa(apt: Apt, codename: str, sources_file: Path) -> tuple[str, ...]:
 
 
 def write_manifest(python: str, folder: Path, opengl: OpenGL) -> None:
-    """Write the manifest of the packages unpacked in `folder`/root, which `manicm_ms.mujoco_gl` reads.
+    """Write the manifest of the packages unpacked in `folder`/root, which `manicm_ms.machine.mujoco_gl` reads.
 
     A part that is not there was not fetched, so the system has it.
     """

@@ -8,7 +8,7 @@ The first that renders is taken:
 4. root with apt: `mesa-vulkan-drivers` and `libvulkan1` are installed; where the distribution's own are too
    old (Debian 12 has 22.3), its backports suite is added first, at the mirror and with the key ring that the
    machine's own apt configuration names.
-5. no root, with apt: the same packages are downloaded and unpacked into `.vulkan/`, which `manicm_ms.vulkan`
+5. no root, with apt: the same packages are downloaded and unpacked into `.vulkan/`, which `manicm_ms.machine.vulkan`
    finds; nothing outside the repository is written.
 
 Each is tried by a real rendering. Only the standard library is used.
@@ -341,7 +341,7 @@ def load_order(python: str, libraries: list[Path]) -> list[Path]:
 
 
 def write_manifest(folder: Path, driver: str, preload: list[str]) -> None:
-    """Write the manifest that `manicm_ms.vulkan` reads."""
+    """Write the manifest that `manicm_ms.machine.vulkan` reads."""
     folder.mkdir(exist_ok=True)
     (folder / "vulkan.json").write_text(json.dumps({"driver": driver, "preload": preload}, indent=2) + "\n")
 
@@ -358,8 +358,9 @@ def device(python: str, source: str) -> str:
     env["MANICM_MS_VULKAN"] = source
     try:
         done = subprocess.run(
-            [python, "-m", "manicm_ms.vulkan"], capture_output=True, text=True, env=env, timeout=300, check=False
-        )
+            [python, "-m", "manicm_ms.machine.vulkan"],
+            capture_output=True, text=True, env=env, timeout=300, check=False,
+        )  # fmt: skip
     except subprocess.TimeoutExpired:
         return ""
     return done.stdout.strip().splitlines()[-1] if done.returncode == 0 else ""
@@ -408,7 +409,9 @@ def ensure_device(python: str) -> str:
         unpack_privately(python, codename)
     if name := existing_device(python):
         return name
-    raise SetupError(f"Mesa's driver is in place and still nothing renders: '{python} -m manicm_ms.vulkan' says why")
+    raise SetupError(
+        f"Mesa's driver is in place and still nothing renders: '{python} -m manicm_ms.machine.vulkan' says why"
+    )
 
 
 def note_missing_graphics(name: str) -> None:

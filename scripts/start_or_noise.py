@@ -16,9 +16,9 @@ import tyro
 from sides_table import approach
 from torch import Tensor
 
-from manicm_ms.devices import torch_threads
 from manicm_ms.envs.vec_env import make_vec
 from manicm_ms.evaluation.rollout import rollout
+from manicm_ms.machine.devices import torch_threads
 from manicm_ms.policies.base import Policy
 from manicm_ms.policies.checkpoint import load_checkpoint
 from manicm_ms.policies.diffusion import DiffusionPolicy, OneStepTeacher

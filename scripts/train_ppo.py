@@ -32,15 +32,15 @@ from stable_baselines3.common.vec_env import VecMonitor, VecNormalize
 from torch import Tensor
 
 from manicm_ms.demos.experts import EXPERTS
-from manicm_ms.devices import torch_threads
 from manicm_ms.envs.sb3 import AbsorbingSuccess, StableBaselinesEnv, normalized_return
 from manicm_ms.envs.vec_env import VecEnv, make_vec
 from manicm_ms.errors import ConfigError, ManicmError
 from manicm_ms.evaluation.intervals import rate_interval
+from manicm_ms.machine.devices import torch_threads
 from manicm_ms.paths import write_json
 from manicm_ms.provenance import package_versions
+from manicm_ms.spec import STATE, ChunkSpec
 from manicm_ms.training.interrupt import StopRequest, stop_requests
-from manicm_ms.types import STATE, ChunkSpec
 
 PICTURE = Path(__file__).resolve().parents[1] / "docs" / "images" / "ppo_slide_block.png"
 SETTINGS, CURVE, WEIGHTS, SCORES = "settings.json", "curve.json", "policy.safetensors", "scores.json"

@@ -4,7 +4,7 @@ Files in the folders that the environment variable MANICM_MS_TASKS names (separa
 this package too, in worker processes as well: a task of one's own need not lie in the repository.
 """
 
-from manicm_ms import mujoco_gl, vulkan
+from manicm_ms.machine import mujoco_gl, vulkan
 from manicm_ms.registry import outside_folders
 
 __path__ += outside_folders("MANICM_MS_TASKS", beside=__path__)

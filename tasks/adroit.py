@@ -31,8 +31,8 @@ from manicm_ms.envs.mujoco_task import (
 )
 from manicm_ms.envs.simulator import ENVS, DemoRule, EnvEntry, Simulator, SimulatorConfig
 from manicm_ms.errors import ExpertFileError
-from manicm_ms.point_cloud import Box
-from manicm_ms.types import ActionSpec, EnvSpec
+from manicm_ms.sensing.point_cloud import Box
+from manicm_ms.spec import ActionSpec, EnvSpec
 
 if TYPE_CHECKING:
     import mujoco

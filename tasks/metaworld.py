@@ -9,7 +9,6 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from manicm_ms import mujoco_gl
 from manicm_ms.demos.experts import EXPERTS, RowPolicy, RowwiseExpertFactory
 from manicm_ms.envs.mujoco_task import (
     DP3,
@@ -24,8 +23,9 @@ from manicm_ms.envs.mujoco_task import (
     sample_or_pad_with_zeros,
 )
 from manicm_ms.envs.simulator import ENVS, DemoRule, EnvEntry, Simulator, SimulatorConfig
-from manicm_ms.point_cloud import Box
-from manicm_ms.types import ActionSpec, EnvSpec
+from manicm_ms.machine import mujoco_gl
+from manicm_ms.sensing.point_cloud import Box
+from manicm_ms.spec import ActionSpec, EnvSpec
 
 if TYPE_CHECKING:
     import mujoco

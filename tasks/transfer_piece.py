@@ -27,9 +27,9 @@ from manicm_ms.envs.ur3e_tabletop import (
     UR3eTabletopEnv,
     ur3e_spec,
 )
-from manicm_ms.point_cloud import Box
 from manicm_ms.robots.limits import pose_in_frame, quat_from_yaw, quat_rotate, yaw_of_quat
 from manicm_ms.robots.ur3e_ag95 import OPENING_MAX, TCP_STEP, TCP_TURN
+from manicm_ms.sensing.point_cloud import Box
 
 ENV_ID, GYM_ID = "ur3e/transfer-piece", "UR3eTransferPiece-v1"
 MAX_EPISODE_STEPS = 180

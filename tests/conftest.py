@@ -15,7 +15,7 @@ if TYPE_CHECKING:
 # Before torch is imported, here and in what the tests start: workers share the cores, and more threads fight over them.
 os.environ.setdefault("OMP_NUM_THREADS", "1")
 
-from manicm_ms import mujoco_gl
+from manicm_ms.machine import mujoco_gl
 
 mujoco_gl.prepare()  # before anything imports mujoco (ManiSkill's kinematics do)
 

@@ -9,9 +9,9 @@ from manicm_ms.envs.simulator import SimulatorConfig
 from manicm_ms.errors import ConfigError
 from manicm_ms.evaluation.judge import Protocol
 from manicm_ms.evaluation.rollout import require_chunk
+from manicm_ms.spec import ChunkSpec
 from manicm_ms.training.optim import FitConfig, PowerDecay
 from manicm_ms.training.presets import StudentPreset
-from manicm_ms.types import ChunkSpec
 
 
 @pytest.mark.parametrize(

@@ -29,7 +29,6 @@ from manicm_ms.benchmark.methods import Method, Training
 from manicm_ms.benchmark.plan import Plan
 from manicm_ms.demos.collect import collect
 from manicm_ms.demos.store import DemoStore, store_path
-from manicm_ms.devices import torch_threads
 from manicm_ms.errors import ConfigError
 from manicm_ms.evaluation.contenders import checkpoint_digest
 from manicm_ms.evaluation.judge import env_maker
@@ -37,6 +36,7 @@ from manicm_ms.evaluation.machine import machine
 from manicm_ms.evaluation.protocol import CLEAN
 from manicm_ms.evaluation.records import EpisodeLog
 from manicm_ms.evaluation.rollout import EpisodeResult, RestartableEnv, rollout
+from manicm_ms.machine.devices import torch_threads
 from manicm_ms.paths import write_json
 from manicm_ms.policies.checkpoint import read_manifest
 from manicm_ms.training.run_folder import snapshot_folders

@@ -299,8 +299,8 @@ def benchmark_command(
     """
     from manicm_ms.benchmark.plan import Plan, parse_envs, parse_seeds, split_names
     from manicm_ms.benchmark.run import benchmark
-    from manicm_ms.devices import resolve_device
     from manicm_ms.envs.vec_env import default_num_envs
+    from manicm_ms.machine.devices import resolve_device
 
     plan = Plan(
         env_ids=parse_envs(envs), methods=tuple(split_names(methods)), seeds=parse_seeds(seeds), preset=preset, out=out,
@@ -363,9 +363,9 @@ def calibrate_command(
         legacy: the board was made by OpenCV before 4.6.
         overwrite: replace the camera file where there is one.
     """
-    from manicm_ms.calibration import CharucoSpec, calibrate
     from manicm_ms.cli.calibration import progress, report
     from manicm_ms.cli.listing import console
+    from manicm_ms.sensing.calibration import CharucoSpec, calibrate
 
     board = CharucoSpec(*squares, square_length, marker_length, dictionary, legacy)
     with progress() as on_image:
@@ -396,7 +396,7 @@ def board_command(
         legacy: the pattern of OpenCV before 4.6.
         overwrite: replace the file where there is one.
     """
-    from manicm_ms.calibration import CharucoSpec, print_board
+    from manicm_ms.sensing.calibration import CharucoSpec, print_board
 
     board = CharucoSpec(*squares, square_length, marker_length, dictionary, legacy)
     paper = print_board(board, out, overwrite=overwrite)
@@ -405,7 +405,7 @@ def board_command(
 
 def doctor_command() -> int:
     """Say what this machine offers and lacks, each trouble with its remedy; exit status 1 where one is fatal."""
-    from manicm_ms.doctor import doctor
+    from manicm_ms.machine.doctor import doctor
 
     return doctor()
 

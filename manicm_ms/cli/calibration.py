@@ -8,8 +8,8 @@ from contextlib import contextmanager
 from rich.console import Console
 from rich.table import Table
 
-from manicm_ms.calibration import Calibration
 from manicm_ms.progress import progress_bars
+from manicm_ms.sensing.calibration import Calibration
 
 _POOR_MM, _POOR_DEG = 3.0, 0.5  # standard errors above which more views are worth their while
 

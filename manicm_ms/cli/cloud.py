@@ -14,11 +14,11 @@ import trimesh
 from numpy.typing import NDArray
 from torch import Tensor
 
-from manicm_ms.camera_model import CLOUD_SIZE, CameraModel, depth_to_cloud, read_camera, read_depth
 from manicm_ms.errors import CameraError, ConfigError
 from manicm_ms.paths import require_free, write_bytes
-from manicm_ms.point_cloud import Box, inside
-from manicm_ms.realism import resolve_realism
+from manicm_ms.sensing.camera_model import CLOUD_SIZE, CameraModel, depth_to_cloud, read_camera, read_depth
+from manicm_ms.sensing.point_cloud import Box, inside
+from manicm_ms.sensing.realism import resolve_realism
 
 Pose = NDArray[Any]
 

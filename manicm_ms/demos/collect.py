@@ -20,7 +20,6 @@ import numpy as np
 import torch
 from rich.console import Console
 
-from manicm_ms.camera_model import CameraModel, read_camera
 from manicm_ms.demos.experts import EXPERTS, Expert
 from manicm_ms.demos.store import OPTIONAL_FIELDS, DemoStore, Episode, frame_shapes
 from manicm_ms.envs.simulator import ENVS, DemoRule
@@ -29,9 +28,10 @@ from manicm_ms.errors import ConfigError, ManicmError, OutputExistsError, StoreE
 from manicm_ms.paths import require_free_space
 from manicm_ms.progress import progress_bars
 from manicm_ms.provenance import package_versions
-from manicm_ms.realism import Realism, RealismSample, realism_name, resolve_realism
 from manicm_ms.seeds import require_seed
-from manicm_ms.types import ACTION, AGENT_POS, DEPTH, IMAGE, POINT_CLOUD, STATE, EnvSpec
+from manicm_ms.sensing.camera_model import CameraModel, read_camera
+from manicm_ms.sensing.realism import Realism, RealismSample, realism_name, resolve_realism
+from manicm_ms.spec import ACTION, AGENT_POS, DEPTH, IMAGE, POINT_CLOUD, STATE, EnvSpec
 
 _OBS_OF_FIELD = {
     "point_cloud": POINT_CLOUD,

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from manicm_ms.errors import UnknownNameError
 from manicm_ms.registry import Registry
-from manicm_ms.types import EnvSpec
+from manicm_ms.spec import EnvSpec
 
 
 class Expert(Protocol):

@@ -14,7 +14,7 @@ import numpy as np
 from manicm_ms.demos.store import OPTIONAL_FIELDS, STORE_ARRAYS, DemoStore
 from manicm_ms.demos.windows import Windows, window_index
 from manicm_ms.demos.zarr_files import array_names, remark_missing
-from manicm_ms.types import ChunkSpec, EnvSpec
+from manicm_ms.spec import ChunkSpec, EnvSpec
 from manicm_ms.wording import counted
 
 MOST_METRES = 10.0

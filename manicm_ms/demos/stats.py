@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from manicm_ms.errors import StoreError
-from manicm_ms.types import ACTION, AGENT_POS, POINT_CLOUD
+from manicm_ms.spec import ACTION, AGENT_POS, POINT_CLOUD
 
 if TYPE_CHECKING:
     from manicm_ms.demos.store import DemoStore

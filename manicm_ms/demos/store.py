@@ -55,7 +55,7 @@ from manicm_ms.demos.zarr_files import (
 )
 from manicm_ms.errors import ManicmError, NoSpaceError, OutputExistsError, StoreError
 from manicm_ms.paths import is_disk_full, require_free_space, sync, take_lock, temporary_folder, write_json
-from manicm_ms.types import EnvSpec
+from manicm_ms.spec import EnvSpec
 
 FORMAT = "manicm_ms demos 1"
 """Value of the attribute `format`; another number means another layout."""

@@ -28,7 +28,7 @@ from manicm_ms.demos.zarr_files import (
     say_missing,
 )
 from manicm_ms.errors import ConfigError, StoreError
-from manicm_ms.types import EnvSpec
+from manicm_ms.spec import EnvSpec
 
 _REQUIRED = ("point_cloud", "agent_pos", "action")
 _RANGED = ("point_cloud", "agent_pos", "action", "privileged_state")

@@ -14,7 +14,7 @@ import torch
 from torch import Tensor
 
 from manicm_ms.demos.experts import require_style
-from manicm_ms.types import EnvSpec
+from manicm_ms.spec import EnvSpec
 
 # Commands are rounded to this grid: torch's vectorised and scalar paths differ in the last bit of sin, exp and the
 # like, so without it the same episode could differ between batch sizes.

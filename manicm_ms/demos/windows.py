@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from manicm_ms.errors import ConfigError
-from manicm_ms.types import ACTION, AGENT_POS, POINT_CLOUD, ChunkSpec
+from manicm_ms.spec import ACTION, AGENT_POS, POINT_CLOUD, ChunkSpec
 
 if TYPE_CHECKING:
     from manicm_ms.demos.store import DemoStore

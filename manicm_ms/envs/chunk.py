@@ -9,7 +9,7 @@ from torch import Tensor
 
 from manicm_ms.envs.simulator import Simulator, StepResult
 from manicm_ms.errors import ManicmError
-from manicm_ms.types import ChunkSpec
+from manicm_ms.spec import ChunkSpec
 
 _DIVERGED = "the simulation diverged: the observation holds NaN or infinity"
 

@@ -12,7 +12,7 @@ from torch import Tensor
 
 from manicm_ms.envs.vec_env import Info, Obs, VecEnv, make_vec
 from manicm_ms.errors import ActionError, ConfigError, ManicmError
-from manicm_ms.types import AGENT_POS, DEPTH, IMAGE, POINT_CLOUD, STATE, ChunkSpec
+from manicm_ms.spec import AGENT_POS, DEPTH, IMAGE, POINT_CLOUD, STATE, ChunkSpec
 
 _STEPS = 6
 _SEEDS = (11, 12)

@@ -20,7 +20,7 @@ from manicm_ms.envs.vector import Info, Obs, VecEnv
 from manicm_ms.envs.worker import FACTS, RowEnv
 from manicm_ms.envs.worker_pool import WorkerPool
 from manicm_ms.errors import BackendError, ManicmError
-from manicm_ms.types import ChunkSpec, EnvSpec
+from manicm_ms.spec import ChunkSpec, EnvSpec
 
 _REAP_S = 0.2  # how long a worker's end may take to show after its pipe broke
 _DEAD_WORKER = (EOFError, BrokenPipeError, ConnectionResetError)

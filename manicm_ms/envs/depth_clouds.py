@@ -10,10 +10,10 @@ import sapien
 import torch
 from torch import Tensor
 
-from manicm_ms.camera_model import CLOUD_SIZE, CameraModel, depth_to_cloud
 from manicm_ms.envs.cameras import MICROMETRE
-from manicm_ms.point_cloud import Box
-from manicm_ms.stereo_depth import StereoDepth
+from manicm_ms.sensing.camera_model import CLOUD_SIZE, CameraModel, depth_to_cloud
+from manicm_ms.sensing.point_cloud import Box
+from manicm_ms.sensing.stereo_depth import StereoDepth
 
 
 class DepthFrame(NamedTuple):

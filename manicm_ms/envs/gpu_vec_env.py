@@ -12,7 +12,7 @@ from manicm_ms.envs.chunk import ActionChunk
 from manicm_ms.envs.requests import Seeds
 from manicm_ms.envs.simulator import EnvEntry, SimulatorConfig
 from manicm_ms.envs.vector import Info, Obs, VecEnv
-from manicm_ms.types import ChunkSpec, EnvSpec
+from manicm_ms.spec import ChunkSpec, EnvSpec
 
 
 class GpuVecEnv(VecEnv):

@@ -11,7 +11,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from manicm_ms import gym_ids, sapien_gpu, vulkan
+from manicm_ms import gym_ids
+from manicm_ms.machine import sapien_gpu, vulkan
 
 vulkan.prepare()  # before SAPIEN is first imported
 
@@ -19,17 +20,17 @@ import mani_skill.envs  # noqa: E402, F401  (registers ManiSkill's own ids)
 from mani_skill.envs.sapien_env import BaseEnv  # noqa: E402
 from mani_skill.utils import registration  # noqa: E402
 
-from manicm_ms.camera_model import CameraModel, default_camera, require_view  # noqa: E402
 from manicm_ms.envs.cameras import CLOUD_POSITION, COLOR, cloud_shader, set_cloud_formats  # noqa: E402
 from manicm_ms.envs.delay import ActionDelay  # noqa: E402
 from manicm_ms.envs.simulator import ENVS, Simulator, SimulatorConfig, StepResult  # noqa: E402
 from manicm_ms.envs.ur3e_tabletop import UR3eTabletopEnv  # noqa: E402
 from manicm_ms.envs.views import CameraView, IdealView, View  # noqa: E402
 from manicm_ms.errors import ConfigError  # noqa: E402
-from manicm_ms.point_cloud import Box  # noqa: E402
-from manicm_ms.realism import RealismRows  # noqa: E402
 from manicm_ms.robots.ur3e_ag95 import TCP_STEP, opening_to_action  # noqa: E402
-from manicm_ms.types import AGENT_POS, DEPTH, IMAGE, POINT_CLOUD, STATE, EnvSpec  # noqa: E402
+from manicm_ms.sensing.camera_model import CameraModel, default_camera, require_view  # noqa: E402
+from manicm_ms.sensing.point_cloud import Box  # noqa: E402
+from manicm_ms.sensing.realism import RealismRows  # noqa: E402
+from manicm_ms.spec import AGENT_POS, DEPTH, IMAGE, POINT_CLOUD, STATE, EnvSpec  # noqa: E402
 
 VIDEO_SHADER = "default"
 _RENDERED = {POINT_CLOUD, IMAGE, DEPTH}

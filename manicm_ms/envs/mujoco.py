@@ -15,8 +15,8 @@ from manicm_ms.envs.mujoco_render import LeanRenderer, Picture, mujoco
 from manicm_ms.envs.mujoco_task import FixedPose, MujocoTask, Outcome
 from manicm_ms.envs.simulator import Simulator, SimulatorConfig, StepResult
 from manicm_ms.errors import BackendError, ConfigError
-from manicm_ms.point_cloud import crop_transformed
-from manicm_ms.types import AGENT_POS, DEPTH, IMAGE, POINT_CLOUD, STATE, EnvSpec
+from manicm_ms.sensing.point_cloud import crop_transformed
+from manicm_ms.spec import AGENT_POS, DEPTH, IMAGE, POINT_CLOUD, STATE, EnvSpec
 
 VIDEO_SIZE = (360, 480)
 EpisodeState = dict[str, NDArray[Any]]

@@ -13,8 +13,8 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from manicm_ms import mujoco_gl
 from manicm_ms.errors import RenderDeviceError
+from manicm_ms.machine import mujoco_gl
 
 mujoco_gl.prepare_import()  # before mujoco is first imported
 

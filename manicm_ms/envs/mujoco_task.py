@@ -12,8 +12,8 @@ from numpy.typing import NDArray
 from packaging.requirements import Requirement
 
 from manicm_ms.errors import BackendError, ConfigError
-from manicm_ms.point_cloud import Box, sample_cloud
-from manicm_ms.types import DP3_FRAME, WORLD_FRAME, ActionSpec, EnvSpec, ObsSpec
+from manicm_ms.sensing.point_cloud import Box, sample_cloud
+from manicm_ms.spec import DP3_FRAME, WORLD_FRAME, ActionSpec, EnvSpec, ObsSpec
 
 MANICM_MS, DP3 = "manicm_ms", "dp3"
 """Observation presets: the clean cloud in the world frame, and the one of the public DP3 wrapper."""

@@ -14,11 +14,11 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from manicm_ms.camera_model import CameraModel
 from manicm_ms.errors import ConfigError, require_at_least
-from manicm_ms.realism import Realism, RealismSample, objects_of
 from manicm_ms.registry import Registry
-from manicm_ms.types import AGENT_POS, DP3_FRAME, OBS_KEYS, POINT_CLOUD, EnvSpec
+from manicm_ms.sensing.camera_model import CameraModel
+from manicm_ms.sensing.realism import Realism, RealismSample, objects_of
+from manicm_ms.spec import AGENT_POS, DP3_FRAME, OBS_KEYS, POINT_CLOUD, EnvSpec
 
 OBS_PRESETS = ("manicm_ms", "dp3")
 """How observations are made: the package's own way, and that of the public DP3 wrapper (Adroit and Meta-World)."""

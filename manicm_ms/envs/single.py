@@ -10,14 +10,14 @@ import gymnasium
 import numpy as np
 import torch
 
-from manicm_ms.camera_model import CameraModel, read_camera
 from manicm_ms.envs.chunk import ActionChunk
 from manicm_ms.envs.requests import SeedStreams
 from manicm_ms.envs.simulator import ENVS, SimulatorConfig
 from manicm_ms.envs.worker import action_space, observation_space
 from manicm_ms.errors import ActionError, BackendError, ConfigError
-from manicm_ms.realism import Realism, resolve_realism
-from manicm_ms.types import AGENT_POS, POINT_CLOUD
+from manicm_ms.sensing.camera_model import CameraModel, read_camera
+from manicm_ms.sensing.realism import Realism, resolve_realism
+from manicm_ms.spec import AGENT_POS, POINT_CLOUD
 
 _ROW = torch.zeros(1, dtype=torch.int64)
 _EVERY_ROW = np.ones(1, dtype=bool)

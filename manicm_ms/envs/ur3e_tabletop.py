@@ -17,17 +17,17 @@ from mani_skill.utils.structs import Actor, Pose
 from mani_skill.utils.structs.types import SceneConfig, SimConfig
 from torch import Tensor
 
-from manicm_ms.camera_model import CameraModel
 from manicm_ms.envs.cameras import D435I, WIDE, FixedCamera
 from manicm_ms.envs.depth_clouds import sapien_pose
 from manicm_ms.envs.maniskill_state import RestorableEnv
 from manicm_ms.envs.row_builders import RowBuilders
 from manicm_ms.errors import ConfigError
-from manicm_ms.point_cloud import Box
-from manicm_ms.realism import RealismRows, true_cameras
 from manicm_ms.robots.limits import quat_rotate
 from manicm_ms.robots.ur3e_ag95 import FINGER_JOINTS, UR3eAG95
-from manicm_ms.types import ActionSpec, EnvSpec, ObsSpec
+from manicm_ms.sensing.camera_model import CameraModel
+from manicm_ms.sensing.point_cloud import Box
+from manicm_ms.sensing.realism import RealismRows, true_cameras
+from manicm_ms.spec import ActionSpec, EnvSpec, ObsSpec
 
 CONTROL_HZ, SIM_HZ = 20, 200
 ACTION = ActionSpec(

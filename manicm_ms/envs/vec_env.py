@@ -9,16 +9,16 @@ from typing import Literal, overload
 
 import torch
 
-from manicm_ms import sapien_gpu
-from manicm_ms.camera_model import CameraModel, read_camera
 from manicm_ms.envs.cpu_vec_env import CpuVecEnv
 from manicm_ms.envs.gpu_vec_env import GpuVecEnv
 from manicm_ms.envs.numpy_arrays import NumpyVecEnv
 from manicm_ms.envs.simulator import ENVS, EnvEntry, SimulatorConfig
 from manicm_ms.envs.vector import Info, Obs, VecEnv
 from manicm_ms.errors import BackendError, ConfigError
-from manicm_ms.realism import Realism, resolve_realism
-from manicm_ms.types import AGENT_POS, POINT_CLOUD, ChunkSpec
+from manicm_ms.machine import sapien_gpu
+from manicm_ms.sensing.camera_model import CameraModel, read_camera
+from manicm_ms.sensing.realism import Realism, resolve_realism
+from manicm_ms.spec import AGENT_POS, POINT_CLOUD, ChunkSpec
 
 BACKENDS = ("auto", "cpu", "gpu")
 ARRAYS = ("torch", "numpy")

@@ -17,7 +17,7 @@ from manicm_ms.envs.requests import Seeds, SeedStreams, reset_mask
 from manicm_ms.envs.simulator import EnvEntry, SimulatorConfig
 from manicm_ms.envs.worker import action_space, observation_space
 from manicm_ms.errors import ActionError, ConfigError
-from manicm_ms.types import ChunkSpec, EnvSpec
+from manicm_ms.spec import ChunkSpec, EnvSpec
 
 Obs = dict[str, Tensor]
 Info = dict[str, Any]

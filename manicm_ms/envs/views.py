@@ -10,15 +10,15 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from manicm_ms.camera_model import CameraModel, nearest_pixels
 from manicm_ms.envs.cameras import CLOUD_POSITION, COLOR, MICROMETRE
 from manicm_ms.envs.depth_clouds import DepthClouds
 from manicm_ms.envs.lighting import Lamp, relight, tint
 from manicm_ms.envs.simulator import SimulatorConfig
 from manicm_ms.envs.ur3e_tabletop import UR3eTabletopEnv
-from manicm_ms.point_cloud import crop_transformed, inside, sample_cloud, sample_cloud_batch, transform
-from manicm_ms.realism import RealismRows, believed_poses, true_cameras
-from manicm_ms.types import DEPTH, IMAGE, POINT_CLOUD
+from manicm_ms.sensing.camera_model import CameraModel, nearest_pixels
+from manicm_ms.sensing.point_cloud import crop_transformed, inside, sample_cloud, sample_cloud_batch, transform
+from manicm_ms.sensing.realism import RealismRows, believed_poses, true_cameras
+from manicm_ms.spec import DEPTH, IMAGE, POINT_CLOUD
 
 Pictures = dict[str, Tensor]
 """The cloud shader's pictures by name: `CLOUD_POSITION` (n, h, w, 4) int32, `COLOR` (n, h, w, 4) uint8."""

@@ -15,7 +15,7 @@ from gymnasium import spaces
 from manicm_ms.envs.chunk import ActionChunk
 from manicm_ms.envs.simulator import ENVS, SimulatorConfig
 from manicm_ms.errors import ManicmError
-from manicm_ms.types import AGENT_POS, DEPTH, IMAGE, POINT_CLOUD, STATE, ChunkSpec, EnvSpec
+from manicm_ms.spec import AGENT_POS, DEPTH, IMAGE, POINT_CLOUD, STATE, ChunkSpec, EnvSpec
 
 
 def observation_space(spec: EnvSpec, obs: tuple[str, ...], n_obs_steps: int | None) -> spaces.Dict:

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 from manicm_ms.errors import ConfigError, SpecMismatchError
 from manicm_ms.evaluation.origins import UNKNOWN, Origin
 from manicm_ms.paths import sha256
-from manicm_ms.types import DP3_FRAME, EnvSpec, require_compatible
+from manicm_ms.spec import DP3_FRAME, EnvSpec, require_compatible
 
 if TYPE_CHECKING:
     from manicm_ms.policies.base import Policy

@@ -11,8 +11,6 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 from rich.console import Console
 from rich.progress import Progress
 
-from manicm_ms.camera_model import CameraModel, read_camera
-from manicm_ms.devices import resolve_device, torch_threads
 from manicm_ms.errors import ConfigError, OutputExistsError
 from manicm_ms.evaluation.contenders import Contender, load_contenders, require_made_for
 from manicm_ms.evaluation.latency import Latency, measure_latency
@@ -24,10 +22,12 @@ from manicm_ms.evaluation.request import OBS_PRESET, command_of, request_of
 from manicm_ms.evaluation.results import compile_results, realism_entry
 from manicm_ms.evaluation.rollout import EpisodeResult, RestartableEnv, rollout
 from manicm_ms.evaluation.video import Take, choose_seeds, film
+from manicm_ms.machine.devices import resolve_device, torch_threads
 from manicm_ms.paths import write_json
 from manicm_ms.progress import progress_bars, working
-from manicm_ms.realism import REALISM, RealismSample, parse_presets
-from manicm_ms.types import AGENT_POS, ChunkSpec, EnvSpec, require_compatible
+from manicm_ms.sensing.camera_model import CameraModel, read_camera
+from manicm_ms.sensing.realism import REALISM, RealismSample, parse_presets
+from manicm_ms.spec import AGENT_POS, ChunkSpec, EnvSpec, require_compatible
 
 if TYPE_CHECKING:
     from manicm_ms.envs.vec_env import VecEnv

@@ -9,9 +9,9 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 import torch
 
-from manicm_ms.devices import torch_threads
 from manicm_ms.errors import ConfigError
-from manicm_ms.types import AGENT_POS, POINT_CLOUD, ChunkSpec, EnvSpec
+from manicm_ms.machine.devices import torch_threads
+from manicm_ms.spec import AGENT_POS, POINT_CLOUD, ChunkSpec, EnvSpec
 
 if TYPE_CHECKING:
     from manicm_ms.policies.base import Policy

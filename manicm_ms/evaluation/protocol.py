@@ -6,8 +6,8 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 from manicm_ms.errors import ConfigError, require_at_least
-from manicm_ms.realism import RealismSample
 from manicm_ms.seeds import require_seed
+from manicm_ms.sensing.realism import RealismSample
 
 CLEAN = "clean"
 """Realism preset of the ideal world."""

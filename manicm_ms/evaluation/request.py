@@ -7,10 +7,10 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-from manicm_ms.camera_model import CameraModel
 from manicm_ms.evaluation.contenders import CONTROL, STUDENT, TEACHER, Contender, checkpoint_digest
 from manicm_ms.evaluation.protocol import CLEAN, Protocol
-from manicm_ms.realism import REALISM
+from manicm_ms.sensing.camera_model import CameraModel
+from manicm_ms.sensing.realism import REALISM
 
 OBS_PRESET = "manicm_ms"
 

@@ -21,7 +21,7 @@ from manicm_ms.evaluation.protocol import CLEAN, Conditions, Protocol
 from manicm_ms.evaluation.rollout import EpisodeResult
 from manicm_ms.evaluation.statistics import compare_paired, mcnemar_exact, success_rate
 from manicm_ms.provenance import package_versions
-from manicm_ms.realism import RealismSample
+from manicm_ms.sensing.realism import RealismSample
 
 SCHEMA_VERSION = 2
 """2: Clopper-Pearson and Tango's intervals, success once and at the end, remarks. 1 had Wilson's and Newcombe's."""

@@ -13,7 +13,7 @@ import numpy as np
 import torch
 
 from manicm_ms.errors import BackendError, ConfigError, NotFiniteError
-from manicm_ms.types import ChunkSpec, require_compatible
+from manicm_ms.spec import ChunkSpec, require_compatible
 
 if TYPE_CHECKING:
     from manicm_ms.envs.vec_env import VecEnv

@@ -12,7 +12,7 @@ from torch import Tensor, nn
 
 from manicm_ms.errors import ConfigError, SpecMismatchError
 from manicm_ms.registry import Registry
-from manicm_ms.types import AGENT_POS, POINT_CLOUD, ChunkSpec, EnvSpec
+from manicm_ms.spec import AGENT_POS, POINT_CLOUD, ChunkSpec, EnvSpec
 
 Config = TypeVar("Config")
 

@@ -30,7 +30,7 @@ from manicm_ms.paths import is_disk_full, replaced_folder, require_free_space, s
 from manicm_ms.policies.base import POLICIES, Policy
 from manicm_ms.policies.model_card import model_card
 from manicm_ms.provenance import package_versions
-from manicm_ms.types import ChunkSpec, EnvSpec
+from manicm_ms.spec import ChunkSpec, EnvSpec
 
 FORMAT = "manicm_ms.checkpoint"
 FORMAT_VERSION = 1

@@ -15,7 +15,7 @@ from manicm_ms.policies.normalizer import Normalizer
 from manicm_ms.policies.points import POINT_CHOICES
 from manicm_ms.policies.unet1d import UNet1D
 from manicm_ms.registry import Registry
-from manicm_ms.types import ACTION, AGENT_POS, POINT_CLOUD, ChunkSpec, EnvSpec
+from manicm_ms.spec import ACTION, AGENT_POS, POINT_CLOUD, ChunkSpec, EnvSpec
 
 
 @dataclass(frozen=True)

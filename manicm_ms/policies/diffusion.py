@@ -17,7 +17,7 @@ from manicm_ms.policies.denoiser import ConditionedDenoiser
 from manicm_ms.policies.finite import finite_obs, require_finite_actions
 from manicm_ms.policies.normalizer import Normalizer
 from manicm_ms.registry import Registry
-from manicm_ms.types import ACTION, ChunkSpec, EnvSpec
+from manicm_ms.spec import ACTION, ChunkSpec, EnvSpec
 
 
 def epsilon_from_x0(x_t: Tensor, x0: Tensor, alpha_bar: Tensor) -> Tensor:

@@ -8,7 +8,7 @@ from typing import Any
 from manicm_ms.policies.base import POLICIES, check_sections, updated_config
 from manicm_ms.policies.denoiser import ConditionedDenoiser, NetworkConfig
 from manicm_ms.policies.diffusion import DiffusionConfig, DiffusionPolicy
-from manicm_ms.types import ChunkSpec, EnvSpec
+from manicm_ms.spec import ChunkSpec, EnvSpec
 
 DP3_NETWORK = NetworkConfig(down_dims=(512, 1024, 2048), resnets_per_stage=2, mid_blocks=2)
 """The published shape."""

@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from manicm_ms.errors import NotFiniteError
-from manicm_ms.types import AGENT_POS, POINT_CLOUD, EnvSpec
+from manicm_ms.spec import AGENT_POS, POINT_CLOUD, EnvSpec
 
 _MOST_NAMED = 3  # entries of agent_pos, and rows, that a message lists
 

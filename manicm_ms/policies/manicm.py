@@ -32,7 +32,7 @@ from manicm_ms.policies.denoiser import ConditionedDenoiser, NetworkConfig
 from manicm_ms.policies.diffusion import PREDICTIONS, DiffusionConfig, DiffusionPolicy, Prediction, executed_actions
 from manicm_ms.policies.finite import finite_obs
 from manicm_ms.policies.normalizer import Normalizer
-from manicm_ms.types import ChunkSpec, EnvSpec
+from manicm_ms.spec import ChunkSpec, EnvSpec
 
 
 @dataclass(frozen=True)

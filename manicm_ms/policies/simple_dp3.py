@@ -9,7 +9,7 @@ from manicm_ms.policies.base import POLICIES
 from manicm_ms.policies.denoiser import NetworkConfig
 from manicm_ms.policies.diffusion import DiffusionPolicy
 from manicm_ms.policies.dp3 import diffusion_teacher
-from manicm_ms.types import ChunkSpec, EnvSpec
+from manicm_ms.spec import ChunkSpec, EnvSpec
 
 SIMPLE_DP3_NETWORK = NetworkConfig(down_dims=(128, 256, 384), resnets_per_stage=1, mid_blocks=1)
 """The published shape."""

@@ -1,6 +1,6 @@
 """Robots as ManiSkill agents; importing a module registers its agent."""
 
-from manicm_ms import mujoco_gl, vulkan
+from manicm_ms.machine import mujoco_gl, vulkan
 
 vulkan.prepare()  # before SAPIEN is first imported
 mujoco_gl.spare_others()  # before ManiSkill imports mujoco

@@ -11,8 +11,8 @@ from torch import Tensor
 from manicm_ms.demos.windows import Windows
 from manicm_ms.policies.denoiser import ConditionedDenoiser
 from manicm_ms.policies.points import POINT_CHOICES
+from manicm_ms.spec import ACTION, POINT_CLOUD
 from manicm_ms.training.stream import subset_generator
-from manicm_ms.types import ACTION, POINT_CLOUD
 
 COND = "cond"
 """(B, K, F) features of K point subsets of each window's observation."""

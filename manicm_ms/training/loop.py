@@ -14,8 +14,8 @@ from lightning_fabric import Fabric
 from rich.console import Console
 from torch import Tensor, nn
 
-from manicm_ms.devices import torch_threads
 from manicm_ms.errors import CheckpointError, TrainingDivergedError
+from manicm_ms.machine.devices import torch_threads
 from manicm_ms.paths import require_free_space
 from manicm_ms.training.interrupt import stop_requests
 from manicm_ms.training.log import LossBar, RunLog, loss_bar

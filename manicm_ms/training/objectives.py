@@ -15,10 +15,10 @@ from manicm_ms.policies.consistency import ConsistencySolver, CorrectedSolver, P
 from manicm_ms.policies.diffusion import DiffusionPolicy, Guess
 from manicm_ms.policies.manicm import ManiCM
 from manicm_ms.registry import Registry
+from manicm_ms.spec import ACTION
 from manicm_ms.training.features import CLEAN_ACTION, COND, draw_points
 from manicm_ms.training.loop import Objective
 from manicm_ms.training.optim import ConstantDecay, DecayRule, averaged
-from manicm_ms.types import ACTION
 
 
 class PolicyObjective(Objective):

@@ -8,8 +8,8 @@ from typing import Any
 from manicm_ms.errors import ConfigError, require_at_least
 from manicm_ms.policies.points import POINT_CHOICES
 from manicm_ms.registry import Registry
+from manicm_ms.spec import ChunkSpec
 from manicm_ms.training.optim import FitConfig
-from manicm_ms.types import ChunkSpec
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -20,16 +20,16 @@ from manicm_ms.demos.remarks import training_remarks
 from manicm_ms.demos.stats import FieldStats, store_stats
 from manicm_ms.demos.store import DemoStore
 from manicm_ms.demos.windows import Windows
-from manicm_ms.devices import resolve_device
 from manicm_ms.errors import CheckpointError, ConfigError, OutputExistsError, require_at_least
+from manicm_ms.machine.devices import resolve_device
 from manicm_ms.policies.checkpoint import read_manifest, save_checkpoint
+from manicm_ms.spec import ChunkSpec, EnvSpec
 from manicm_ms.training.device import make_fabric, resolve_precision
 from manicm_ms.training.loop import Batches, FitResult, Snapshots, fit
 from manicm_ms.training.objectives import PolicyObjective
 from manicm_ms.training.optim import FitConfig
 from manicm_ms.training.presets import preset_identity
 from manicm_ms.training.run_folder import RunFolder, open_run, snapshot_folder, training_folder
-from manicm_ms.types import ChunkSpec, EnvSpec
 
 _NOT_IDENTITY = ("log_every", "save_every", "precision")  # the precision that is used stands beside the preset
 

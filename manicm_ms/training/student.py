@@ -6,19 +6,19 @@ from pathlib import Path
 
 from rich.console import Console
 
-from manicm_ms.devices import torch_threads
 from manicm_ms.errors import CheckpointError, ConfigError, SpecMismatchError
+from manicm_ms.machine.devices import torch_threads
 from manicm_ms.policies.checkpoint import load_checkpoint, read_manifest
 from manicm_ms.policies.diffusion import DiffusionPolicy
 from manicm_ms.policies.manicm import ManiCM
 from manicm_ms.progress import working
 from manicm_ms.seeds import require_seed
+from manicm_ms.spec import EnvSpec, require_compatible
 from manicm_ms.training.features import encode_windows
 from manicm_ms.training.loop import Batches
 from manicm_ms.training.objectives import DISTILLATIONS, PolicyObjective
 from manicm_ms.training.presets import StudentPreset
 from manicm_ms.training.session import Session, read_demos
-from manicm_ms.types import EnvSpec, require_compatible
 
 
 def distill(

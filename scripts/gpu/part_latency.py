@@ -25,9 +25,9 @@ sys.path.append(str(Path(__file__).resolve().parents[1]))  # bench_latency lies 
 from bench_latency import CHUNK, TEACHERS, door_spec
 from kit import Budget, Results, part_arguments, results_of
 
-from manicm_ms.devices import resolve_device
 from manicm_ms.evaluation.latency import example_observation
 from manicm_ms.evaluation.machine import machine
+from manicm_ms.machine.devices import resolve_device
 from manicm_ms.policies.base import Policy, make_policy
 from manicm_ms.policies.manicm import ManiCM
 

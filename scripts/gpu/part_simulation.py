@@ -80,7 +80,7 @@ def choose_driver(args: argparse.Namespace, results: Results) -> dict[str, str] 
         log.unlink(missing_ok=True)
         limit_s = PROBE_S if name == NVIDIA else SOFTWARE_PROBE_S
         status = run_limited(
-            [sys.executable, "-m", "manicm_ms.vulkan"], limit_s, log, environment(variables), args.work
+            [sys.executable, "-m", "manicm_ms.machine.vulkan"], limit_s, log, environment(variables), args.work
         )
         said = last_line(log)
         if status == 0:

@@ -152,7 +152,7 @@ def gather_debs(load: Load, folder: Path) -> None:
 
 
 def gather_software(load: Load, folder: Path) -> None:
-    """Pack this machine's own lavapipe with the libraries that it needs, as `manicm_ms.vulkan` reads them."""
+    """Pack this machine's own lavapipe with the libraries that it needs, as `manicm_ms.machine.vulkan` reads them."""
     archive = folder / "software.tar.xz"
     if not load.software or archive.is_file():
         return

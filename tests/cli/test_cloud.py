@@ -11,15 +11,15 @@ import torch
 import trimesh
 import yaml
 
-from manicm_ms.camera_model import default_camera, depth_to_cloud, read_camera, write_camera, write_depth
 from manicm_ms.cli import USER_ERROR, main
 from manicm_ms.envs.simulator import ENVS, SimulatorConfig
 from manicm_ms.envs.vec_env import make_vec
 from manicm_ms.errors import CameraError
 from manicm_ms.paths import asset
-from manicm_ms.point_cloud import Box
-from manicm_ms.realism import REALISM, RealismRows, believed_poses, true_cameras
-from manicm_ms.types import DEPTH, POINT_CLOUD
+from manicm_ms.sensing.camera_model import default_camera, depth_to_cloud, read_camera, write_camera, write_depth
+from manicm_ms.sensing.point_cloud import Box
+from manicm_ms.sensing.realism import REALISM, RealismRows, believed_poses, true_cameras
+from manicm_ms.spec import DEPTH, POINT_CLOUD
 
 # Of ur3e/slide-block under d435i: the crop floor of 12 mm; and under clean.
 WORKSPACE, IDEAL_WORKSPACE = (Box((0.15, -0.25, floor), (0.50, 0.25, 0.15)) for floor in (0.012, 0.003))

@@ -3,7 +3,7 @@
 import numpy as np
 
 from manicm_ms.demos.store import DemoStore, Episode
-from manicm_ms.types import ActionSpec, EnvSpec, ObsSpec
+from manicm_ms.spec import ActionSpec, EnvSpec, ObsSpec
 
 SPEC = EnvSpec(
     env_id="toy/sample",

@@ -17,7 +17,7 @@ from manicm_ms.demos.experts import EXPERTS
 from manicm_ms.demos.store import DemoStore
 from manicm_ms.envs.vec_env import make_vec
 from manicm_ms.errors import ConfigError, ManicmError, StoreError, UnknownNameError
-from manicm_ms.types import AGENT_POS, POINT_CLOUD, STATE
+from manicm_ms.spec import AGENT_POS, POINT_CLOUD, STATE
 
 HERE = Path(__file__).parent
 

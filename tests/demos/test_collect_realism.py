@@ -6,7 +6,7 @@ from manicm_ms.demos.collect import collect
 from manicm_ms.demos.store import DemoStore
 from manicm_ms.envs.simulator import ENVS
 from manicm_ms.errors import StoreError, UnknownNameError
-from manicm_ms.realism import REALISM
+from manicm_ms.sensing.realism import REALISM
 
 ENV_ID, PRESET = "ur3e/slide-block", "d435i+dr"
 

@@ -11,7 +11,7 @@ from manicm_ms.demos.store import DemoStore
 from manicm_ms.envs.simulator import ENVS, DemoRule, SimulatorConfig
 from manicm_ms.envs.vec_env import GpuVecEnv
 from manicm_ms.errors import ConfigError, StoreError
-from manicm_ms.types import AGENT_POS, POINT_CLOUD, STATE
+from manicm_ms.spec import AGENT_POS, POINT_CLOUD, STATE
 
 
 def attempts(rule, env_id=ENV_ID, first_seed=0, wanted=3, num_envs=2):

@@ -16,11 +16,11 @@ from manicm_ms.demos.store import DemoStore
 from manicm_ms.demos.survey import survey
 from manicm_ms.envs.simulator import ENVS
 from manicm_ms.errors import ConfigError, OutputExistsError, SpecMismatchError, StoreError, UnknownNameError
-from manicm_ms.point_cloud import farthest_point_order
 from manicm_ms.policies.checkpoint import load_checkpoint
+from manicm_ms.sensing.point_cloud import farthest_point_order
+from manicm_ms.spec import EnvSpec
 from manicm_ms.training.presets import TEACHER_PRESETS
 from manicm_ms.training.teacher import train_teacher
-from manicm_ms.types import EnvSpec
 
 ENV_ID = "ur3e/slide-block"
 LENGTHS = (30, 41)

@@ -9,7 +9,7 @@ from store_samples import PROVENANCE, SPEC, episode, make_store
 from manicm_ms.demos.remarks import field_remarks, length_remarks, store_remarks, training_remarks, window_remarks
 from manicm_ms.demos.store import DemoStore
 from manicm_ms.demos.windows import Windows
-from manicm_ms.types import ChunkSpec
+from manicm_ms.spec import ChunkSpec
 
 RNG = np.random.default_rng(0)
 CLOUDS = RNG.uniform(-0.5, 0.5, (30, 16, 6)) + np.array([0, 0, 0, 0.5, 0.5, 0.5])

@@ -10,7 +10,7 @@ from store_samples import PROVENANCE, SPEC, episode, make_store, require_same
 
 from manicm_ms.demos.store import DemoStore
 from manicm_ms.errors import StoreError
-from manicm_ms.realism import REALISM
+from manicm_ms.sensing.realism import REALISM
 
 NAMES = ("table_height", "cube.mass_factor")
 

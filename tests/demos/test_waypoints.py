@@ -4,7 +4,7 @@ import pytest
 import torch
 
 from manicm_ms.demos.waypoints import Motion, WaypointFollower, Waypoints, stopping_speed, waypoint_table
-from manicm_ms.types import ActionSpec, EnvSpec, ObsSpec
+from manicm_ms.spec import ActionSpec, EnvSpec, ObsSpec
 
 LAYOUT = {"tcp_pose": (0, 7), "tcp_target_pose": (7, 14)}
 MOTION = Motion(metres_per_unit=0.02, radians_per_unit=0.08, max_opening=0.09)

@@ -6,7 +6,7 @@ import torch
 
 from manicm_ms.demos.windows import Windows, window_index
 from manicm_ms.errors import ConfigError
-from manicm_ms.types import ChunkSpec
+from manicm_ms.spec import ChunkSpec
 
 
 def dp3_sequences(episode_ends, horizon, pad_before, pad_after):

@@ -7,7 +7,7 @@ import torch
 
 from manicm_ms.demos.experts import EXPERTS
 from manicm_ms.envs.simulator import ENVS, DemoRule, EnvEntry, Simulator, StepResult
-from manicm_ms.types import AGENT_POS, POINT_CLOUD, STATE, ActionSpec, EnvSpec, ObsSpec
+from manicm_ms.spec import AGENT_POS, POINT_CLOUD, STATE, ActionSpec, EnvSpec, ObsSpec
 
 ENV_ID, LAST_ID, TWICE_ID = "toy/blinker", "toy/blinker-last", "toy/blinker-twice"
 MAX_STEPS = 20

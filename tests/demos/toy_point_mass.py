@@ -9,7 +9,7 @@ import torch
 from manicm_ms.demos.experts import EXPERTS
 from manicm_ms.envs.simulator import ENVS, EnvEntry, Simulator, StepResult
 from manicm_ms.errors import UnknownNameError
-from manicm_ms.types import AGENT_POS, POINT_CLOUD, STATE, ActionSpec, EnvSpec, ObsSpec
+from manicm_ms.spec import AGENT_POS, POINT_CLOUD, STATE, ActionSpec, EnvSpec, ObsSpec
 
 ENV_ID = "toy/point-mass"
 MAX_STEPS = 40

@@ -4,7 +4,7 @@ import torch
 
 from manicm_ms.envs.simulator import ENVS, EnvEntry, Simulator, SimulatorConfig, StepResult
 from manicm_ms.errors import RenderDeviceError
-from manicm_ms.types import AGENT_POS, DEPTH, IMAGE, POINT_CLOUD, STATE, ActionSpec, EnvSpec, ObsSpec
+from manicm_ms.spec import AGENT_POS, DEPTH, IMAGE, POINT_CLOUD, STATE, ActionSpec, EnvSpec, ObsSpec
 
 MAX_STEPS = 12
 CRASH_X = 3.0  # m: a row beyond it makes `step` raise

@@ -6,8 +6,8 @@ import torch
 
 from manicm_ms.envs.cameras import CLOUD_POSITION, D435I, MICROMETRE
 from manicm_ms.envs.simulator import ENVS, SimulatorConfig
-from manicm_ms.point_cloud import Box
-from manicm_ms.types import DEPTH, IMAGE, POINT_CLOUD, STATE
+from manicm_ms.sensing.point_cloud import Box
+from manicm_ms.spec import DEPTH, IMAGE, POINT_CLOUD, STATE
 
 ENV_ID = "ur3e/slide-block"
 ACCURACY = 2e-5  # m: the renderer interpolates in single precision, some 0.7 m away

@@ -6,7 +6,7 @@ import torch
 from point_mass_env import CRASH_X, DIVERGE_Y, GOAL_X, MAX_STEPS, RAISE_Y
 
 from manicm_ms.envs.chunk import ActionChunk
-from manicm_ms.types import AGENT_POS, POINT_CLOUD, ChunkSpec
+from manicm_ms.spec import AGENT_POS, POINT_CLOUD, ChunkSpec
 
 
 def make(num_rows, n_obs_steps=2, n_action_steps=3):

@@ -7,15 +7,15 @@ import point_mass_env
 import pytest
 import torch
 
-from manicm_ms.camera_model import default_camera
 from manicm_ms.envs.cameras import CLOUD_POSITION, COLOR, D435I
 from manicm_ms.envs.depth_clouds import DepthClouds, sapien_pose
 from manicm_ms.envs.maniskill import workspace_of
 from manicm_ms.envs.simulator import ENVS, SimulatorConfig
 from manicm_ms.errors import ConfigError, UnknownNameError
-from manicm_ms.point_cloud import Box
-from manicm_ms.stereo_depth import StereoDepth
-from manicm_ms.types import POINT_CLOUD
+from manicm_ms.sensing.camera_model import default_camera
+from manicm_ms.sensing.point_cloud import Box
+from manicm_ms.sensing.stereo_depth import StereoDepth
+from manicm_ms.spec import POINT_CLOUD
 
 ENV_ID = "ur3e/slide-block"
 CAMERA = default_camera()

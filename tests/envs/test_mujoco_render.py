@@ -8,9 +8,9 @@ import pytest
 if find_spec("mujoco") is None:
     pytest.skip("the MuJoCo suites are an extra, which is not installed", allow_module_level=True)
 
-from manicm_ms import mujoco_gl
 from manicm_ms.envs.mujoco_render import LeanRenderer, mujoco
 from manicm_ms.errors import RenderDeviceError
+from manicm_ms.machine import mujoco_gl
 
 SCENE = """
 <mujoco>

@@ -15,7 +15,7 @@ from manicm_ms.envs.conformance import check_vec_env
 from manicm_ms.envs.simulator import ENVS
 from manicm_ms.envs.vec_env import make_vec, resolve_backend
 from manicm_ms.errors import BackendError, ConfigError, RenderDeviceError, UnknownNameError
-from manicm_ms.types import AGENT_POS, POINT_CLOUD, STATE, ChunkSpec
+from manicm_ms.spec import AGENT_POS, POINT_CLOUD, STATE, ChunkSpec
 
 SOME = ("metaworld/reach", "metaworld/stick-pull", "adroit/hammer", "adroit/pen")
 

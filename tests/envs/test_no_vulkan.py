@@ -6,7 +6,7 @@ import sys
 
 import pytest
 
-from manicm_ms import vulkan
+from manicm_ms.machine import vulkan
 
 # One process for both: it takes longest to begin.
 SCRIPT = """

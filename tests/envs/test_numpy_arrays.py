@@ -15,7 +15,7 @@ from point_mass_env import MAX_STEPS, SOUND, Raises, make_spec
 from manicm_ms.envs.simulator import EnvEntry, SimulatorConfig
 from manicm_ms.envs.vec_env import GpuVecEnv, NumpyVecEnv, make_vec
 from manicm_ms.errors import ConfigError
-from manicm_ms.types import AGENT_POS, IMAGE, STATE
+from manicm_ms.spec import AGENT_POS, IMAGE, STATE
 
 FAST = np.array([[0.6, 0.0], [0.0, 0.0]], np.float32)  # the first row succeeds in its second step
 REST = np.zeros((2, 2), np.float32)

@@ -6,12 +6,12 @@ import numpy as np
 import pytest
 import torch
 
-from manicm_ms.camera_model import default_camera
 from manicm_ms.envs.simulator import ENVS, SimulatorConfig
 from manicm_ms.errors import ConfigError
-from manicm_ms.realism import REALISM, Realism, believed_poses, displaced, true_cameras
 from manicm_ms.robots.ur3e_ag95 import FINGER_JOINTS, UR3eAG95
-from manicm_ms.types import AGENT_POS, DEPTH, IMAGE, POINT_CLOUD, STATE
+from manicm_ms.sensing.camera_model import default_camera
+from manicm_ms.sensing.realism import REALISM, Realism, believed_poses, displaced, true_cameras
+from manicm_ms.spec import AGENT_POS, DEPTH, IMAGE, POINT_CLOUD, STATE
 
 ENV_ID, SEED = "ur3e/slide-block", 11
 ROW = torch.zeros(1, dtype=torch.int64)
@@ -217,7 +217,7 @@ def samples(count):
 
 
 def test_rows_of_cameras_are_those_of_single_rows():
-    from manicm_ms.realism import RealismRows
+    from manicm_ms.sensing.realism import RealismRows
 
     camera, drawn = default_camera(), samples(6)
     together = true_cameras(camera, RealismRows(drawn))

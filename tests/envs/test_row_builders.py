@@ -15,7 +15,7 @@ from manicm_ms.envs.row_builders import RowBuilders
 from manicm_ms.envs.simulator import SimulatorConfig
 from manicm_ms.envs.ur3e_tabletop import UR3eTabletopEnv
 from manicm_ms.errors import ConfigError
-from manicm_ms.realism import REALISM, Realism, RealismRows
+from manicm_ms.sensing.realism import REALISM, Realism, RealismRows
 
 N = 3
 

@@ -13,7 +13,7 @@ from stable_baselines3.common.vec_env import VecMonitor, VecNormalize
 from manicm_ms.envs.sb3 import AbsorbingSuccess, StableBaselinesEnv, normalized_return
 from manicm_ms.envs.vec_env import make_vec
 from manicm_ms.errors import ConfigError
-from manicm_ms.types import AGENT_POS, STATE, ChunkSpec
+from manicm_ms.spec import AGENT_POS, STATE, ChunkSpec
 
 REST = np.zeros((2, 2), np.float32)
 CRASH = np.array([[0.0, -1.0], [0.0, 0.0]], np.float32)  # the first row cannot be observed after its fourth step

@@ -18,7 +18,7 @@ from train_ppo import CURVE, HELD, SETTINGS, WEIGHTS, Held, IdlePlayer, Judge, T
 
 from manicm_ms.envs.vec_env import make_vec
 from manicm_ms.errors import ConfigError
-from manicm_ms.types import STATE
+from manicm_ms.spec import STATE
 
 SHORT = Train(env=SOUND, steps=2048, eval_every=1024, eval_episodes=6)
 

@@ -16,7 +16,7 @@ from manicm_ms.envs.conformance import PROPERTIES, check_vec_env
 from manicm_ms.envs.simulator import ENVS, SimulatorConfig
 from manicm_ms.envs.vec_env import CpuVecEnv, GpuVecEnv, make_vec, resolve_backend
 from manicm_ms.errors import ActionError, BackendError, ConfigError, ManicmError, RenderDeviceError, UnknownNameError
-from manicm_ms.types import AGENT_POS, POINT_CLOUD, STATE, ChunkSpec
+from manicm_ms.spec import AGENT_POS, POINT_CLOUD, STATE, ChunkSpec
 
 SUITES = ("toy/", "adroit/", "metaworld/")  # 50 and 3 tasks of one kind: test_mujoco_suites.py takes some of each
 OURS = [env_id for env_id in ENVS.names() if not env_id.startswith(SUITES)]

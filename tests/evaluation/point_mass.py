@@ -8,7 +8,7 @@ import torch
 
 from manicm_ms.errors import ActionError, BackendError
 from manicm_ms.policies.base import Policy, starting_noise
-from manicm_ms.types import ActionSpec, ChunkSpec, EnvSpec, ObsSpec
+from manicm_ms.spec import ActionSpec, ChunkSpec, EnvSpec, ObsSpec
 
 SPEC = EnvSpec(
     env_id="toy/point-mass",

@@ -17,7 +17,7 @@ from manicm_ms.evaluation.request import OBS_PRESET, request_of
 from manicm_ms.policies.base import make_policy
 from manicm_ms.policies.checkpoint import save_checkpoint
 from manicm_ms.policies.manicm import ManiCM
-from manicm_ms.types import ChunkSpec
+from manicm_ms.spec import ChunkSpec
 
 ENV = "ur3e/slide-block"
 SHIPPED = Path(__file__).parents[2] / "checkpoints" / "slide_block"

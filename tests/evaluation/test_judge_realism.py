@@ -16,7 +16,7 @@ from manicm_ms.evaluation.judge import EnvMaker, evaluate, judge, log_file
 from manicm_ms.evaluation.protocol import Protocol
 from manicm_ms.evaluation.records import EpisodeLog
 from manicm_ms.evaluation.statistics import compare_paired
-from manicm_ms.realism import REALISM
+from manicm_ms.sensing.realism import REALISM
 
 SEEDS = tuple(range(200, 216))
 PRESETS = ("clean", "d435i")

@@ -6,9 +6,9 @@ import pytest
 import torch
 from point_mass import CHUNK, SPEC, Proportional
 
-from manicm_ms.devices import torch_threads
 from manicm_ms.errors import ConfigError
 from manicm_ms.evaluation.latency import example_observation, measure_latency
+from manicm_ms.machine.devices import torch_threads
 
 
 class Busy(Proportional):

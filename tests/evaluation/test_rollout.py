@@ -9,13 +9,13 @@ import pytest
 import torch
 from point_mass import CHUNK, DT, REACH, SPEC, PointMass, Proportional
 
-from manicm_ms.devices import torch_threads
 from manicm_ms.errors import BackendError, ConfigError, SpecMismatchError
 from manicm_ms.evaluation.rollout import MAX_RESTARTS, EpisodeResult, RestartableEnv, decision_noise, rollout
+from manicm_ms.machine.devices import torch_threads
 from manicm_ms.policies.base import make_policy
 from manicm_ms.policies.finite import require_finite_actions
 from manicm_ms.policies.manicm import ManiCM
-from manicm_ms.types import ActionSpec, ChunkSpec
+from manicm_ms.spec import ActionSpec, ChunkSpec
 
 SEEDS = list(range(100, 123))
 

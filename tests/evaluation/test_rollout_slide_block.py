@@ -8,7 +8,7 @@ import pytest
 from manicm_ms.envs.vec_env import make_vec
 from manicm_ms.evaluation.rollout import RestartableEnv, rollout
 from manicm_ms.policies.base import make_policy
-from manicm_ms.types import AGENT_POS, POINT_CLOUD, ChunkSpec
+from manicm_ms.spec import AGENT_POS, POINT_CLOUD, ChunkSpec
 
 CHUNK = ChunkSpec(n_obs_steps=2, horizon=4, n_action_steps=3)
 SEEDS = list(range(6))

@@ -5,7 +5,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from manicm_ms.types import ActionSpec, ChunkSpec, EnvSpec, ObsSpec
+from manicm_ms.spec import ActionSpec, ChunkSpec, EnvSpec, ObsSpec
 
 TINY = {"network": {"down_dims": (16, 32), "n_groups": 4, "step_embed_dim": 16, "point_widths": (16, 32)}}
 """A network that acts in a millisecond."""

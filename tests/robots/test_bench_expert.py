@@ -13,7 +13,7 @@ from manicm_ms.demos.experts import EXPERTS
 from manicm_ms.envs.chunk import ActionChunk
 from manicm_ms.envs.simulator import ENVS, SimulatorConfig
 from manicm_ms.robots.ur3e_ag95 import JOINT_EFFORT
-from manicm_ms.types import STATE
+from manicm_ms.spec import STATE
 
 ENV_ID, STEPS, DT = "ur3e/slide-block", 20, 1 / 200
 

@@ -5,7 +5,7 @@ from contextlib import contextmanager
 import torch
 
 from manicm_ms.envs.simulator import ENVS, SimulatorConfig
-from manicm_ms.types import AGENT_POS, POINT_CLOUD, STATE
+from manicm_ms.spec import AGENT_POS, POINT_CLOUD, STATE
 
 ROW = torch.zeros(1, dtype=torch.int64)
 

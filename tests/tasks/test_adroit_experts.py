@@ -18,7 +18,7 @@ from manicm_ms.demos.store import DemoStore
 from manicm_ms.envs.simulator import ENVS
 from manicm_ms.errors import ExpertFileError, UnknownNameError
 from manicm_ms.paths import sha256
-from manicm_ms.types import STATE
+from manicm_ms.spec import STATE
 
 GIVEN = Path(__file__).parents[3] / "shared" / "adroit_experts"
 ENV_IDS = ("adroit/door", "adroit/hammer", "adroit/pen")

@@ -14,7 +14,7 @@ if find_spec("gymnasium_robotics") is None:
 from manicm_ms.tasks.adroit import TASKS
 
 from manicm_ms.envs.mujoco_render import mujoco
-from manicm_ms.types import AGENT_POS, DEPTH, IMAGE, POINT_CLOUD, STATE
+from manicm_ms.spec import AGENT_POS, DEPTH, IMAGE, POINT_CLOUD, STATE
 
 NAMES = [task.env_id.removeprefix("adroit/") for task in TASKS]
 HAND_QPOS = {"door": slice(4, -2), "hammer": slice(2, -7), "pen": slice(None, -6)}  # as DP3's wrapper slices it

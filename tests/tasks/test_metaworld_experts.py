@@ -18,7 +18,7 @@ from manicm_ms.demos.experts import EXPERTS
 from manicm_ms.demos.store import DemoStore
 from manicm_ms.envs.simulator import ENVS
 from manicm_ms.errors import UnknownNameError
-from manicm_ms.types import STATE
+from manicm_ms.spec import STATE
 
 
 def expert_of(env_id, num_envs=1, style=None):

@@ -16,7 +16,7 @@ from manicm_ms.envs import mujoco_task
 from manicm_ms.envs.mujoco_render import mujoco
 from manicm_ms.envs.simulator import ENVS
 from manicm_ms.errors import BackendError, ConfigError
-from manicm_ms.types import AGENT_POS, POINT_CLOUD, STATE
+from manicm_ms.spec import AGENT_POS, POINT_CLOUD, STATE
 
 ROWS = {task.env_id: task for task in TASKS}
 BENCHMARK = {

@@ -9,7 +9,7 @@ import torch
 from manicm_ms.demos.experts import EXPERTS
 from manicm_ms.envs.chunk import ActionChunk
 from manicm_ms.envs.simulator import ENVS, SimulatorConfig
-from manicm_ms.types import STATE
+from manicm_ms.spec import STATE
 
 TASKS = [env_id for env_id in ENVS.names(tag="ur3e") if env_id in EXPERTS.names()]
 SEEDS = (500, 501)

@@ -14,7 +14,7 @@ from manicm_ms.tasks.metaworld import MAX_EPISODE_STEPS, MetaWorldEnv
 from test_adroit_table import suite_env as adroit_env
 from test_metaworld_table import ROWS, suite_env
 
-from manicm_ms.types import STATE
+from manicm_ms.spec import STATE
 
 STALE = ("dial-turn", "drawer-open", "faucet-open", "lever-pull", "window-close", "window-open")
 SOME = (*STALE, "door-lock", "reach", "pick-place", "stick-pull", "hand-insert", "assembly")

@@ -13,9 +13,9 @@ from torch import nn
 
 from manicm_ms.policies.diffusion import DiffusionConfig, DiffusionPolicy, OneStepTeacher
 from manicm_ms.policies.manicm import ManiCM
+from manicm_ms.spec import ChunkSpec
 from manicm_ms.training.features import CLEAN_ACTION, COND
 from manicm_ms.training.objectives import ConsistencyDistillation
-from manicm_ms.types import ChunkSpec
 
 SIGMA = 0.2  # small enough that the exact x0 is seldom clipped
 KINDS = ("sample", "epsilon")

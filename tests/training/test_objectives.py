@@ -16,6 +16,7 @@ from manicm_ms.policies.base import make_policy
 from manicm_ms.policies.consistency import boundary_scalings
 from manicm_ms.policies.diffusion import DiffusionConfig, DiffusionPolicy
 from manicm_ms.policies.manicm import ConsistencyConfig, ManiCM
+from manicm_ms.spec import ChunkSpec
 from manicm_ms.training.features import CLEAN_ACTION, COND, draw_points, encode_windows
 from manicm_ms.training.objectives import (
     ConsistencyDistillation,
@@ -24,7 +25,6 @@ from manicm_ms.training.objectives import (
 )
 from manicm_ms.training.optim import PowerDecay
 from manicm_ms.training.stream import step_generator, subset_generator
-from manicm_ms.types import ChunkSpec
 
 CHUNK = ChunkSpec()
 

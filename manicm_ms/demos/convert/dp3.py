@@ -14,7 +14,6 @@ from typing import Any
 
 import numpy as np
 
-from manicm_ms.camera_model import CLOUD_SIZE
 from manicm_ms.demos.convert.base import IMPORTERS, Tally
 from manicm_ms.demos.convert.raw_store import OPTIONAL, RawStore
 from manicm_ms.demos.convert.scales import Scales, decide
@@ -23,9 +22,10 @@ from manicm_ms.demos.store import DemoStore, Episode
 from manicm_ms.envs.simulator import ENVS
 from manicm_ms.errors import ConfigError, SpecMismatchError
 from manicm_ms.paths import require_free_space
-from manicm_ms.point_cloud import sample_cloud
 from manicm_ms.provenance import package_versions
-from manicm_ms.types import ActionSpec, EnvSpec, ObsSpec, require_compatible
+from manicm_ms.sensing.camera_model import CLOUD_SIZE
+from manicm_ms.sensing.point_cloud import sample_cloud
+from manicm_ms.spec import ActionSpec, EnvSpec, ObsSpec, require_compatible
 
 _FRAME, _CONTROL_HZ = "world", 10.0
 

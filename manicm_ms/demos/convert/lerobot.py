@@ -18,7 +18,7 @@ from manicm_ms.demos.convert.writer import Writer
 from manicm_ms.demos.store import Episode, frame_shapes
 from manicm_ms.errors import ConfigError
 from manicm_ms.paths import write_json
-from manicm_ms.types import EnvSpec
+from manicm_ms.spec import EnvSpec
 
 PYTHON_VARIABLE = "MANICM_MS_LEROBOT_PYTHON"
 """Environment variable that names the interpreter that has lerobot."""
