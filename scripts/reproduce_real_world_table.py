@@ -20,8 +20,8 @@ import tyro
 
 from manicm_ms.errors import CheckpointError, ConfigError, ManicmError, UnknownNameError
 from manicm_ms.evaluation.intervals import PairedCounts, paired_difference_interval, rate_interval
-from manicm_ms.evaluation.report import interval_text, success_text
 from manicm_ms.evaluation.statistics import mcnemar_exact
+from manicm_ms.evaluation.text import interval_text, success_text
 from manicm_ms.paths import write_json, write_text
 
 REPO = Path(__file__).resolve().parents[1]
@@ -93,7 +93,7 @@ def pair_of(task: str, checkpoints: Path) -> list[Path]:
 
 def play(task: str, pair: list[Path], episodes: int, seed: int, out: Path, command: str) -> dict[str, Any]:
     """Evaluate a task's pair and control under each preset; return what the page needs of it, JSON values."""
-    from manicm_ms.evaluation.judge import evaluate
+    from manicm_ms.evaluation.evaluate import evaluate
 
     named = [folder.relative_to(Path.cwd()) if folder.is_relative_to(Path.cwd()) else folder for folder in pair]
     presets = ",".join(PRESETS)

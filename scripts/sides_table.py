@@ -12,7 +12,7 @@ from pathlib import Path
 import numpy as np
 import tyro
 
-from manicm_ms.evaluation.judge import slug
+from manicm_ms.evaluation.protocol import slug
 from manicm_ms.evaluation.rollout import EpisodeResult
 from manicm_ms.robots.ur3e_ag95 import TCP_STEP
 

@@ -7,7 +7,7 @@ import pytest
 
 from manicm_ms.envs.simulator import SimulatorConfig
 from manicm_ms.errors import ConfigError
-from manicm_ms.evaluation.judge import Protocol
+from manicm_ms.evaluation.protocol import Protocol
 from manicm_ms.evaluation.rollout import require_chunk
 from manicm_ms.spec import ChunkSpec
 from manicm_ms.training.optim import FitConfig, PowerDecay

@@ -30,9 +30,9 @@ from manicm_ms.benchmark.plan import Plan
 from manicm_ms.demos.collect import collect
 from manicm_ms.demos.store import DemoStore, store_path
 from manicm_ms.errors import ConfigError
-from manicm_ms.evaluation.contenders import checkpoint_digest
-from manicm_ms.evaluation.judge import env_maker
 from manicm_ms.evaluation.machine import machine
+from manicm_ms.evaluation.play import env_maker
+from manicm_ms.evaluation.policies import checkpoint_digest
 from manicm_ms.evaluation.protocol import CLEAN
 from manicm_ms.evaluation.records import EpisodeLog
 from manicm_ms.evaluation.rollout import EpisodeResult, RestartableEnv, rollout

@@ -9,8 +9,9 @@ from typing import Any, NamedTuple
 from rich.table import Table
 
 from manicm_ms.benchmark.summary import PAPER_GROUPS
-from manicm_ms.evaluation.report import format_ms, template
+from manicm_ms.evaluation.report import template
 from manicm_ms.evaluation.resampling import MANY_TRAININGS, RECIPE
+from manicm_ms.evaluation.text import format_ms
 from manicm_ms.paths import write_json, write_text
 
 _PAPER_COLUMNS = (*PAPER_GROUPS, "average", "ms")

@@ -218,13 +218,13 @@ def evaluate_command(
     allow_seen_seeds: bool = False,
     to_the_end: bool = True,
 ) -> int:
-    """Evaluate checkpoints on the same fresh seeds: success with intervals, paired difference, latency, report.
+    """Evaluate checkpoints on the same held-out seeds: success with intervals, paired difference, latency, report.
 
     Args:
         checkpoints: checkpoint folders, the teacher first and the student last.
         env: environment id.
         out: folder of results.json, report.md and report.html.
-        episodes: fresh seeds, each played once by each policy.
+        episodes: held-out seeds, each played once by each policy.
         seed: first of them.
         num_envs: environments that play at once; by default one a core.
         backend: where to simulate.
@@ -238,16 +238,19 @@ def evaluate_command(
         allow_seen_seeds: evaluate on seeds of a checkpoint's own demonstrations, which is refused otherwise.
         to_the_end: play on after a success that is certain, so that success at the last step is known too.
     """
-    from manicm_ms.evaluation.judge import evaluate
-    from manicm_ms.evaluation.results import without_rate
+    from rich.console import Console
 
+    from manicm_ms.evaluation.evaluate import evaluate
+    from manicm_ms.evaluation.screen import show
+
+    console = Console()
     results = evaluate(
         _at_least_one(checkpoints, "checkpoint folder"), env, episodes, seed, out, num_envs=num_envs, backend=backend,
         device=device, control=control, videos=videos, threads=threads, realism=realism,
         camera=camera, obs_preset=obs_preset, allow_seen_seeds=allow_seen_seeds, to_the_end=to_the_end,
-        command=this_command(),
+        command=this_command(), console=console,
     )  # fmt: skip
-    return 1 if without_rate(results) else 0
+    return 0 if show(results, out, console) else 1
 
 
 def benchmark_command(

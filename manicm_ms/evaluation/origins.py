@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 from manicm_ms.errors import ConfigError
 
 if TYPE_CHECKING:
-    from manicm_ms.evaluation.contenders import Contender
+    from manicm_ms.evaluation.protocol import EvaluatedPolicy
 
 ATTEMPTS_PER_DEMO = 2
 """Where a checkpoint holds only the first seed of its demonstrations: seeds a demonstration that count as seen, as the
@@ -79,30 +79,30 @@ def _seeds_of(data: Mapping[str, Any]) -> Collection[int]:
     return range(first, first + ATTEMPTS_PER_DEMO * data["episodes"])
 
 
-def require_unseen(contenders: Sequence[Contender], env_id: str, seeds: Sequence[int]) -> None:
+def require_unseen(policies: Sequence[EvaluatedPolicy], env_id: str, seeds: Sequence[int]) -> None:
     """Raise ConfigError where a policy would be evaluated on seeds of its own demonstrations."""
-    for contender in contenders:
-        if not (seen := contender.origin.seen(env_id, seeds)):
+    for evaluated in policies:
+        if not (seen := evaluated.origin.seen(env_id, seeds)):
             continue
-        beyond = max(contender.origin.demo_seeds[env_id]) + 1
+        beyond = max(evaluated.origin.demo_seeds[env_id]) + 1
         raise ConfigError(
             f"{len(seen)} of the {len(seeds)} seeds ({seen[0]} is the first) are those of the demonstrations that "
-            f"checkpoint {contender.checkpoint} learnt from: choose --seed {beyond} or more, or add "
+            f"checkpoint {evaluated.checkpoint} learnt from: choose --seed {beyond} or more, or add "
             "--allow-seen-seeds if you mean it"
         )
 
 
-def seen_counts(contenders: Sequence[Contender], env_id: str, seeds: Sequence[int]) -> dict[str, int]:
+def seen_counts(policies: Sequence[EvaluatedPolicy], env_id: str, seeds: Sequence[int]) -> dict[str, int]:
     """Return policy -> how many of `seeds` are those of its own demonstrations, where there are any."""
-    counts = {c.name: len(c.origin.seen(env_id, seeds)) for c in contenders}
+    counts = {c.name: len(c.origin.seen(env_id, seeds)) for c in policies}
     return {name: count for name, count in counts.items() if count}
 
 
-def remarks(contenders: Sequence[Contender], env_id: str, seeds: Sequence[int]) -> list[str]:
+def remarks(policies: Sequence[EvaluatedPolicy], env_id: str, seeds: Sequence[int]) -> list[str]:
     """Return what a reader of the results must know of where the policies come from, a sentence each."""
-    distinct = list({c.checkpoint: c for c in reversed(contenders)}.values())[::-1]  # the control is its teacher's
+    distinct = list({c.checkpoint: c for c in reversed(policies)}.values())[::-1]  # the control is its teacher's
     lines = [
-        f"{name}: {count} of the {len(seeds)} seeds are those of its own demonstrations: not a rate on fresh seeds."
+        f"{name}: {count} of the {len(seeds)} seeds are those of its own demonstrations: not a rate on held-out seeds."
         for name, count in seen_counts(distinct, env_id, seeds).items()
     ]
     lines += [
@@ -110,12 +110,12 @@ def remarks(contenders: Sequence[Contender], env_id: str, seeds: Sequence[int]) 
         for c in distinct
         if env_id in c.origin.demo_seeds and not c.origin.demo_seeds[env_id]
     ]
-    for contender in distinct:
-        if others := [task for task in contender.origin.tasks if task != env_id]:
-            lines.append(f"{contender.name} was trained for {' and '.join(others)} and is evaluated on {env_id}.")
+    for evaluated in distinct:
+        if others := [task for task in evaluated.origin.tasks if task != env_id]:
+            lines.append(f"{evaluated.name} was trained for {' and '.join(others)} and is evaluated on {env_id}.")
     teachers = {c.origin.run: c.name for c in distinct if c.origin.teacher_run is None and c.origin.run is not None}
-    for contender in distinct:
-        source = contender.origin.teacher_run
+    for evaluated in distinct:
+        source = evaluated.origin.teacher_run
         if source is not None and teachers and source not in teachers:
-            lines.append(f"{contender.name} was distilled from another training than {' or '.join(teachers.values())}.")
+            lines.append(f"{evaluated.name} was distilled from another training than {' or '.join(teachers.values())}.")
     return lines

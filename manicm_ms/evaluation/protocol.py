@@ -1,16 +1,26 @@
-"""What is fixed about an evaluation beside its policies."""
+"""The ground of an evaluation: what is fixed about it, its policies with their roles, and how their files are named."""
 
 from __future__ import annotations
 
+import re
 from collections.abc import Callable
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 from manicm_ms.errors import ConfigError, require_at_least
+from manicm_ms.evaluation.origins import UNKNOWN, Origin
 from manicm_ms.seeds import require_seed
 from manicm_ms.sensing.realism import RealismSample
 
+if TYPE_CHECKING:
+    from manicm_ms.policies.base import Policy
+
+TEACHER, CONTROL, STUDENT, OTHER = "teacher", "control", "student", "policy"
+"""Roles: a diffusion policy, the same in one step without distillation, a distilled policy, any other."""
 CLEAN = "clean"
 """Realism preset of the ideal world."""
+OBS_PRESET = "manicm_ms"
+"""The package's own way of making observations."""
 
 Conditions = Callable[[str, int], RealismSample]
 """(realism preset, seed) -> what is drawn for that episode beside its scene."""
@@ -53,3 +63,27 @@ class Protocol:
             )
         require_at_least(1, num_envs=self.num_envs, threads=self.threads, repetitions=self.repetitions)
         require_at_least(0, videos=self.videos)
+
+
+@dataclass(frozen=True)
+class EvaluatedPolicy:
+    """A policy to be evaluated.
+
+    Attributes:
+        name: its name in tables and files, unique in the evaluation.
+        role: what its checkpoint is, one of the four above.
+        checkpoint: folder it was loaded from, as the caller named it.
+        policy: the policy itself, on the device it shall run on.
+        origin: what its checkpoint says of its making.
+    """
+
+    name: str
+    role: str
+    checkpoint: str
+    policy: Policy
+    origin: Origin = UNKNOWN
+
+
+def slug(name: str) -> str:
+    """Return `name` as a file name."""
+    return re.sub(r"[^\w-]+", "-", name).strip("-")

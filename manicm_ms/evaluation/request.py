@@ -7,17 +7,15 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-from manicm_ms.evaluation.contenders import CONTROL, STUDENT, TEACHER, Contender, checkpoint_digest
-from manicm_ms.evaluation.protocol import CLEAN, Protocol
+from manicm_ms.evaluation.policies import checkpoint_digest
+from manicm_ms.evaluation.protocol import CLEAN, CONTROL, OBS_PRESET, STUDENT, TEACHER, EvaluatedPolicy, Protocol
 from manicm_ms.sensing.camera_model import CameraModel
 from manicm_ms.sensing.realism import REALISM
-
-OBS_PRESET = "manicm_ms"
 
 
 def request_of(
     protocol: Protocol,
-    contenders: Sequence[Contender],
+    policies: Sequence[EvaluatedPolicy],
     backend: str,
     device: str,
     camera: CameraModel | None,
@@ -30,15 +28,15 @@ def request_of(
         "episodes": len(protocol.seeds),
         "backend": backend,
         "device": device,
-        "policies": [[c.name, _place(i, c), checkpoint_digest(c.checkpoint)] for i, c in enumerate(contenders)],
+        "policies": [[c.name, _place(i, c), checkpoint_digest(c.checkpoint)] for i, c in enumerate(policies)],
         **_requested_realism(protocol.realism, camera),
         **({} if obs_preset == OBS_PRESET else {"obs_preset": obs_preset}),
     }
 
 
-def _place(index: int, contender: Contender) -> str:
+def _place(index: int, policy: EvaluatedPolicy) -> str:
     """Return what folders of all versions call the place of a policy in the list; its role is another matter."""
-    return CONTROL if contender.role == CONTROL else STUDENT if index else TEACHER
+    return CONTROL if policy.role == CONTROL else STUDENT if index else TEACHER
 
 
 def _requested_realism(presets: tuple[str, ...], camera: CameraModel | None) -> dict[str, Any]:

@@ -6,7 +6,6 @@ from collections.abc import Callable, Mapping, Sequence
 from functools import partial
 from typing import Any
 
-from manicm_ms.evaluation.contenders import Contender
 from manicm_ms.evaluation.intervals import (
     CONFIDENCE,
     DIFFERENCE_METHOD,
@@ -17,7 +16,8 @@ from manicm_ms.evaluation.intervals import (
 from manicm_ms.evaluation.latency import Latency
 from manicm_ms.evaluation.machine import machine
 from manicm_ms.evaluation.origins import remarks, seen_counts
-from manicm_ms.evaluation.protocol import CLEAN, Conditions, Protocol
+from manicm_ms.evaluation.play import Played
+from manicm_ms.evaluation.protocol import CLEAN, Conditions, EvaluatedPolicy, Protocol
 from manicm_ms.evaluation.rollout import EpisodeResult
 from manicm_ms.evaluation.statistics import compare_paired, mcnemar_exact, success_rate
 from manicm_ms.provenance import package_versions
@@ -29,43 +29,45 @@ INTERVALS = {"confidence": CONFIDENCE, "rate": RATE_METHOD, "difference": DIFFER
 
 
 def compile_results(
-    contenders: Sequence[Contender],
+    policies: Sequence[EvaluatedPolicy],
     protocol: Protocol,
-    episodes: Mapping[str, Sequence[EpisodeResult]],
+    played: Played,
     latencies: Mapping[str, Latency],
     command: str,
     conditions: Conditions = lambda preset, seed: {},
 ) -> dict[str, Any]:
-    """Return the content of results.json without its part on realism presets.
+    """Return the content of results.json, no videos yet.
 
     Args:
-        contenders: the policies; the first and the last are compared.
+        policies: the first and the last are compared.
         protocol: seeds and sizes.
-        episodes: policy -> results in the order of the seeds.
+        played: results under every preset; the first preset's are the main ones.
         latencies: policy -> time of a decision.
         command: the command line that reproduces it.
         conditions: what was drawn for an episode.
     """
-    drawn = partial(conditions, protocol.realism[0])
-    policies = [_policy_entry(c, episodes[c.name], latencies[c.name], drawn) for c in contenders]
-    return {
+    drawn, episodes = partial(conditions, protocol.realism[0]), played.by_preset[protocol.realism[0]]
+    results = {
         "schema_version": SCHEMA_VERSION,
         "env_id": protocol.env_id,
         "seeds": list(protocol.seeds),
-        "seen_seeds": seen_counts(contenders, protocol.env_id, protocol.seeds),
-        "remarks": remarks(contenders, protocol.env_id, protocol.seeds),
+        "seen_seeds": seen_counts(policies, protocol.env_id, protocol.seeds),
+        "remarks": remarks(policies, protocol.env_id, protocol.seeds),
         "intervals": INTERVALS,
         "command": command,
         "versions": package_versions(),
         "machine": machine(),
         "num_envs": protocol.num_envs,
-        "policies": policies,
-        "paired": _paired_entry(contenders[0], contenders[-1], episodes) if len(contenders) > 1 else None,
+        "policies": [_policy_entry(p, episodes[p.name], latencies[p.name], drawn) for p in policies],
+        "paired": _paired_entry(policies[0], policies[-1], episodes) if len(policies) > 1 else None,
     }
+    if protocol.realism != (CLEAN,):
+        results["realism"] = _realism_entry(policies, protocol, played.by_preset, conditions)
+    return {**results, "success_rule": played.spec.success_rule, "videos": []}
 
 
-def realism_entry(
-    contenders: Sequence[Contender],
+def _realism_entry(
+    policies: Sequence[EvaluatedPolicy],
     protocol: Protocol,
     by_preset: Mapping[str, Mapping[str, Sequence[EpisodeResult]]],
     conditions: Conditions,
@@ -75,12 +77,12 @@ def realism_entry(
     reference = CLEAN if CLEAN in presets else presets[0]
     rows = []
     for preset in presets:
-        for contender in contenders:
-            ideal, episodes = (by_preset[name][contender.name] for name in (reference, preset))
+        for evaluated in policies:
+            ideal, episodes = (by_preset[name][evaluated.name] for name in (reference, preset))
             rows.append({
                 "preset": preset,
-                "policy": contender.name,
-                "role": contender.role,
+                "policy": evaluated.name,
+                "role": evaluated.role,
                 **rate_entry(episodes),
                 "against_reference": None if preset == reference else pair_entry(ideal, episodes),
                 "episodes": _episode_entries(episodes, partial(conditions, preset)),
@@ -170,23 +172,23 @@ def without_rate(results: Mapping[str, Any]) -> list[str]:
 
 
 def _policy_entry(
-    contender: Contender,
+    evaluated: EvaluatedPolicy,
     episodes: Sequence[EpisodeResult],
     latency: Latency,
     drawn: Callable[[int], RealismSample],
 ) -> dict[str, Any]:
     return {
-        "name": contender.name,
-        "role": contender.role,
-        "checkpoint": contender.checkpoint,
-        "trained_for": list(contender.origin.tasks),
-        "nfe": contender.policy.nfe,
+        "name": evaluated.name,
+        "role": evaluated.role,
+        "checkpoint": evaluated.checkpoint,
+        "trained_for": list(evaluated.origin.tasks),
+        "nfe": evaluated.policy.nfe,
         **rate_entry(episodes),
         "latency_ms": {"median": latency.median_ms, "p95": latency.p95_ms, "n": latency.n},
         "device": latency.device,
         "threads": latency.threads,
         "dtype": latency.dtype,
-        "parameters": sum(p.numel() for p in contender.policy.parameters()),
+        "parameters": sum(p.numel() for p in evaluated.policy.parameters()),
         "episodes": _episode_entries(episodes, drawn),
     }
 
@@ -197,7 +199,7 @@ def _episode_entries(episodes: Sequence[EpisodeResult], drawn: Callable[[int], R
 
 
 def _paired_entry(
-    first: Contender, second: Contender, episodes: Mapping[str, Sequence[EpisodeResult]]
+    first: EvaluatedPolicy, second: EvaluatedPolicy, episodes: Mapping[str, Sequence[EpisodeResult]]
 ) -> dict[str, Any] | None:
     pair = pair_entry(episodes[first.name], episodes[second.name])
     if pair is None:

@@ -2,17 +2,21 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import ExitStack
 from itertools import islice
 from pathlib import Path
-from typing import TYPE_CHECKING, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import imageio_ffmpeg
 import numpy as np
 import torch
+from rich.console import Console
 
+from manicm_ms.evaluation.play import EnvMaker
+from manicm_ms.evaluation.protocol import EvaluatedPolicy, Protocol, slug
 from manicm_ms.evaluation.rollout import EpisodeResult
+from manicm_ms.progress import progress_bars
 
 if TYPE_CHECKING:
     from manicm_ms.envs.vec_env import VecEnv
@@ -99,6 +103,59 @@ def _film_group(vec_env: VecEnv, group: Sequence[Take], fps: float) -> list[bool
 
 def _frames(vec_env: VecEnv) -> np.ndarray:
     return torch.as_tensor(vec_env.render_video_frames()).cpu().numpy()  # (N, H, W, 3) uint8
+
+
+def film_pair(
+    policies: Sequence[EvaluatedPolicy],
+    protocol: Protocol,
+    envs: EnvMaker,
+    out: Path,
+    episodes: Mapping[str, Sequence[EpisodeResult]],
+    fps: float,
+    console: Console,
+) -> list[dict[str, Any]]:
+    """Film the first and the last policy on the same seeds; return what was filmed.
+
+    Args:
+        policies: teacher first, student last; one alone is filmed alone.
+        protocol: how many seeds, and under which preset: the first.
+        envs: makes the vector env.
+        out: folder of the evaluation; videos that it holds are not made again.
+        episodes: policy -> results in the order of the seeds.
+        fps: frames (control steps) per second.
+        console: for progress, and for a line where filming fails: a report without pictures is better than none.
+
+    Returns:
+        A dictionary with seed, policy, success and file (relative to `out`) for each video that is there.
+    """
+    cast = [policies[0], policies[-1]] if len(policies) > 1 else [policies[0]]
+    seeds = choose_seeds(episodes[cast[0].name], episodes[cast[-1].name], protocol.videos)
+    scenes = [(seed, evaluated) for seed in seeds for evaluated in cast]
+    by_seed = {c.name: {e.seed: e for e in episodes[c.name]} for c in cast}
+    entries, takes = [], []
+    for seed, evaluated in scenes:
+        file = f"videos/{slug(evaluated.name)}-{seed}.mp4"
+        episode = by_seed[evaluated.name][seed]
+        entries.append({"seed": seed, "policy": evaluated.name, "success": episode.success, "file": file})
+        if not (out / file).exists():
+            takes.append(Take(episode, out / file))
+    if not takes:
+        return entries
+    try:
+        with progress_bars(console, "{task.fields[successes]}") as progress:
+            bar = progress.add_task("videos", total=len(takes), successes="")
+            vec_env = envs.for_film(min(protocol.num_envs, len(takes)), protocol.realism[0])
+            try:
+                for take, success in film(vec_env, takes, fps):
+                    progress.update(bar, advance=1)
+                    if success != take.episode.success:  # a simulation that does not repeat itself
+                        take.path.unlink()
+            finally:
+                vec_env.close()
+    except Exception as error:  # whatever the renderer raised
+        reason = " ".join(f"{type(error).__name__}: {error}".split())
+        console.print(f"not all videos were made: {reason}", style="yellow", markup=False, soft_wrap=True)
+    return [entry for entry in entries if (out / str(entry["file"])).exists()]
 
 
 class Mp4Writer:

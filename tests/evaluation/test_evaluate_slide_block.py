@@ -10,8 +10,8 @@ from rich.console import Console
 
 from manicm_ms.envs.simulator import ENVS
 from manicm_ms.errors import CheckpointError, ConfigError, SpecMismatchError, UnknownNameError
-from manicm_ms.evaluation.contenders import checkpoint_digest, load_contenders
-from manicm_ms.evaluation.judge import evaluate
+from manicm_ms.evaluation.evaluate import evaluate
+from manicm_ms.evaluation.policies import checkpoint_digest, load_policies
 from manicm_ms.evaluation.protocol import Protocol
 from manicm_ms.evaluation.request import OBS_PRESET, request_of
 from manicm_ms.policies.base import make_policy
@@ -49,7 +49,7 @@ def run(checkpoints, out, env_id=ENV, episodes=2, seed=100_000, **options):
     )
 
 
-def test_a_pair_of_checkpoints_is_judged_with_its_control_and_filmed(pair, tmp_path):
+def test_a_pair_of_checkpoints_is_evaluated_with_its_control_and_filmed(pair, tmp_path):
     results = run(pair, tmp_path / "report", videos=1)
     stored = json.loads((tmp_path / "report" / "results.json").read_text())
     assert stored == json.loads(json.dumps(results))
@@ -75,15 +75,15 @@ def test_without_control_only_the_checkpoints_are_played_and_seen_seeds_may_be_m
 
 
 def test_the_role_is_the_checkpoints_own(pair):
-    assert [(c.name, c.role) for c in load_contenders([pair[1]])] == [("student", "student")]
-    roles = [(c.name, c.role) for c in load_contenders(pair[::-1])]
+    assert [(c.name, c.role) for c in load_policies([pair[1]])] == [("student", "student")]
+    roles = [(c.name, c.role) for c in load_policies(pair[::-1])]
     assert roles == [("student", "student"), ("teacher", "teacher")]
 
 
 def test_an_evaluation_that_an_earlier_version_began_goes_on(pair):
     def identified(checkpoints):
         protocol = Protocol(ENV, (5, 6), num_envs=1)
-        return request_of(protocol, load_contenders(checkpoints), "cpu", "cpu", None, OBS_PRESET)
+        return request_of(protocol, load_policies(checkpoints), "cpu", "cpu", None, OBS_PRESET)
 
     teacher, student = (checkpoint_digest(str(path)) for path in pair)
     earlier = {"env_id": ENV, "seed": 5, "episodes": 2, "backend": "cpu", "device": "cpu"}

@@ -6,17 +6,17 @@ import pytest
 from point_mass import Proportional
 
 from manicm_ms.errors import ConfigError
-from manicm_ms.evaluation.contenders import STUDENT, TEACHER, Contender
 from manicm_ms.evaluation.origins import Origin, remarks, require_unseen, seen_counts
+from manicm_ms.evaluation.protocol import STUDENT, TEACHER, EvaluatedPolicy
 from manicm_ms.policies.checkpoint import read_manifest
 
 CHECKPOINTS = Path(__file__).parents[2] / "checkpoints"
 ENV = "toy/point-mass"
 
 
-def contender(name, provenance, env_id=ENV):
+def evaluated(name, provenance, env_id=ENV):
     role = STUDENT if "teacher" in provenance else TEACHER
-    return Contender(name, role, f"runs/{name}", Proportional(), Origin.read(env_id, provenance))
+    return EvaluatedPolicy(name, role, f"runs/{name}", Proportional(), Origin.read(env_id, provenance))
 
 
 def trained(seeds, env_id=ENV, run="aa", **more):
@@ -62,7 +62,7 @@ def test_a_checkpoint_that_says_nothing_forbids_nothing(provenance):
 
 
 def test_seeds_of_the_demonstrations_are_refused_with_the_way_out():
-    policies = [contender("teacher", trained([5, 6, 9])), contender("student", trained([5, 6, 9]))]
+    policies = [evaluated("teacher", trained([5, 6, 9])), evaluated("student", trained([5, 6, 9]))]
     with pytest.raises(
         ConfigError, match=r"2 of the 4 seeds \(6 is the first\) .*runs/teacher.*--seed 10 or more"
     ) as error:
@@ -76,19 +76,19 @@ def test_seeds_of_the_demonstrations_are_refused_with_the_way_out():
 
 
 def test_demonstrations_of_unknown_seeds_are_told():
-    imported = contender("teacher", trained([-1, -2]))
+    imported = evaluated("teacher", trained([-1, -2]))
     require_unseen([imported], ENV, range(10))
     (line,) = remarks([imported], ENV, range(10))
     assert line.startswith("teacher: the seeds of its demonstrations are not known")
-    assert remarks([contender("teacher", {})], ENV, range(10)) == []
+    assert remarks([evaluated("teacher", {})], ENV, range(10)) == []
 
 
 def test_another_task_and_another_teacher_are_told():
-    teacher = contender("teacher", trained([1], run="tt"))
+    teacher = evaluated("teacher", trained([1], run="tt"))
     own = trained([1], teacher={"provenance": trained([1], run="tt")})
-    assert remarks([teacher, contender("student", own)], ENV, [50]) == []
-    (line,) = remarks([teacher, contender("student", trained([1], env_id="toy/b"), "toy/b")], ENV, [50])
+    assert remarks([teacher, evaluated("student", own)], ENV, [50]) == []
+    (line,) = remarks([teacher, evaluated("student", trained([1], env_id="toy/b"), "toy/b")], ENV, [50])
     assert line == f"student was trained for toy/b and is evaluated on {ENV}."
     stranger = trained([1], teacher={"provenance": trained([1], run="ss")})
-    (line,) = remarks([teacher, contender("student", stranger)], ENV, [50])
+    (line,) = remarks([teacher, evaluated("student", stranger)], ENV, [50])
     assert line == "student was distilled from another training than teacher."

@@ -1,4 +1,4 @@
-"""Judging under several realism presets: same seeds, each against the ideal world, resumable, told in every report."""
+"""Evaluation under several realism presets: same seeds, each against the ideal world, in every report."""
 
 import io
 import json
@@ -10,11 +10,12 @@ from point_mass import SPEC, PointMass, Proportional
 from rich.console import Console
 
 from manicm_ms.errors import ConfigError, OutputExistsError, UnknownNameError
-from manicm_ms.evaluation.contenders import STUDENT, TEACHER, Contender
+from manicm_ms.evaluation.evaluate import evaluate, evaluate_policies
 from manicm_ms.evaluation.intervals import rate_interval
-from manicm_ms.evaluation.judge import EnvMaker, evaluate, judge, log_file
-from manicm_ms.evaluation.protocol import Protocol
+from manicm_ms.evaluation.play import EnvMaker, log_file
+from manicm_ms.evaluation.protocol import STUDENT, TEACHER, EvaluatedPolicy, Protocol
 from manicm_ms.evaluation.records import EpisodeLog
+from manicm_ms.evaluation.screen import show
 from manicm_ms.evaluation.statistics import compare_paired
 from manicm_ms.sensing.realism import REALISM
 
@@ -34,14 +35,15 @@ def run(out, *, presets=PRESETS, made=None, request=None):
             made.append((preset, env))
         return env
 
-    contenders = [
-        Contender("teacher", TEACHER, "runs/teacher", Proportional(gain=2.0, noise_scale=0.6)),
-        Contender("student", STUDENT, "runs/student", Proportional(gain=2.5, noise_scale=0.7)),
+    policies = [
+        EvaluatedPolicy("teacher", TEACHER, "runs/teacher", Proportional(gain=2.0, noise_scale=0.6)),
+        EvaluatedPolicy("student", STUDENT, "runs/student", Proportional(gain=2.5, noise_scale=0.7)),
     ]
     protocol = Protocol(SPEC.env_id, SEEDS, num_envs=4, repetitions=1, videos=0, realism=presets)
     envs = EnvMaker(for_policy, lambda n, preset: PointMass(n, chunk=None), conditions)
     console = Console(file=io.StringIO(), width=200)
-    results = judge(contenders, protocol, envs, out, request or {"seed": 200}, "the command", console)
+    results = evaluate_policies(policies, protocol, envs, out, request or {"seed": 200}, "the command", console)
+    show(results, out, console)
     return results, console.file.getvalue()
 
 

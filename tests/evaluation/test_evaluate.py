@@ -1,4 +1,4 @@
-"""The whole judgement on a real, small env: numbers derive from records, reports hold them, kills do no harm."""
+"""The whole evaluation on a real, small env: numbers derive from records, reports hold them, kills do no harm."""
 
 import dataclasses
 import io
@@ -11,25 +11,27 @@ from rich.console import Console
 
 from manicm_ms.cli import evaluate_command
 from manicm_ms.errors import ConfigError, OutputExistsError, SpecMismatchError
-from manicm_ms.evaluation.contenders import CONTROL, STUDENT, TEACHER, Contender, require_made_for
+from manicm_ms.evaluation.evaluate import evaluate_policies
 from manicm_ms.evaluation.intervals import rate_interval
-from manicm_ms.evaluation.judge import EnvMaker, judge
 from manicm_ms.evaluation.origins import Origin
-from manicm_ms.evaluation.protocol import Protocol
+from manicm_ms.evaluation.play import EnvMaker
+from manicm_ms.evaluation.policies import require_made_for
+from manicm_ms.evaluation.protocol import CONTROL, STUDENT, TEACHER, EvaluatedPolicy, Protocol
 from manicm_ms.evaluation.records import EpisodeLog
 from manicm_ms.evaluation.report import render_markdown
 from manicm_ms.evaluation.results import without_rate
+from manicm_ms.evaluation.screen import show
 from manicm_ms.evaluation.statistics import compare_paired
 
 SEEDS = tuple(range(100, 124))
 COMMAND = "manicm-ms evaluate teacher student --env toy/point-mass --episodes 24 --seed 100 --out report"
 
 
-def contenders():
+def policies():
     return [
-        Contender("teacher", TEACHER, "runs/teacher", Proportional(gain=2.0, noise_scale=0.6)),
-        Contender("teacher, one step", CONTROL, "runs/teacher", Proportional(gain=0.5)),
-        Contender("student", STUDENT, "runs/student", Proportional(gain=2.5, noise_scale=0.7)),
+        EvaluatedPolicy("teacher", TEACHER, "runs/teacher", Proportional(gain=2.0, noise_scale=0.6)),
+        EvaluatedPolicy("teacher, one step", CONTROL, "runs/teacher", Proportional(gain=0.5)),
+        EvaluatedPolicy("student", STUDENT, "runs/student", Proportional(gain=2.5, noise_scale=0.7)),
     ]
 
 
@@ -43,13 +45,14 @@ def run(out, *, request=None, crash_at=None, made=None, videos=2, seeds=SEEDS, f
     protocol = Protocol(SPEC.env_id, seeds, num_envs=4, repetitions=3, videos=videos)
     envs = EnvMaker(for_policy, lambda n, preset: film_env(n, chunk=None))
     console = Console(file=io.StringIO(), width=160)
-    results = judge(contenders(), protocol, envs, out, request or {"seed": 100}, COMMAND, console)
+    results = evaluate_policies(policies(), protocol, envs, out, request or {"seed": 100}, COMMAND, console)
+    show(results, out, console)
     return results, console.file.getvalue()
 
 
 @pytest.fixture(scope="module")
 def report(tmp_path_factory):
-    out = tmp_path_factory.mktemp("judge") / "report"
+    out = tmp_path_factory.mktemp("evaluate") / "report"
     results, printed = run(out, crash_at={103: 2})
     return out, results, printed
 
@@ -199,10 +202,12 @@ def test_ctrl_c_while_filming_leaves_results_and_report(tmp_path, monkeypatch):
     assert (tmp_path / "report" / "report.html").exists()
 
 
-def test_a_policy_alone_is_judged_without_a_pair(tmp_path):
+def test_a_policy_alone_is_evaluated_without_a_pair(tmp_path):
     protocol = Protocol(SPEC.env_id, SEEDS[:4], num_envs=2, repetitions=1, videos=0)
     envs = EnvMaker(lambda policy, n, _: PointMass(n, policy.chunk), lambda n, _: PointMass(n, chunk=None))
-    results = judge(contenders()[:1], protocol, envs, tmp_path / "r", {}, COMMAND, Console(file=io.StringIO()))
+    results = evaluate_policies(
+        policies()[:1], protocol, envs, tmp_path / "r", {}, COMMAND, Console(file=io.StringIO())
+    )
     assert results["paired"] is None
     assert "On the same" not in render_markdown(results)
 
@@ -219,11 +224,11 @@ def test_where_every_episode_crashed_there_is_no_rate(tmp_path, monkeypatch):
     for text in (printed, (out / "report.md").read_text(), (out / "report.html").read_text()):
         assert "3 = -" in text
         assert "0.0 %" not in text
-    monkeypatch.setattr("manicm_ms.evaluation.judge.evaluate", lambda *args, **options: results)
+    monkeypatch.setattr("manicm_ms.evaluation.evaluate.evaluate", lambda *args, **options: results)
     assert evaluate_command((out,), SPEC.env_id) == 1, "the exit status"
     mixed, _ = run(tmp_path / "mixed", seeds=seeds, crash_at=dict.fromkeys(seeds[:2], 1), videos=0)
     assert without_rate(mixed) == []
-    monkeypatch.setattr("manicm_ms.evaluation.judge.evaluate", lambda *args, **options: mixed)
+    monkeypatch.setattr("manicm_ms.evaluation.evaluate.evaluate", lambda *args, **options: mixed)
     assert evaluate_command((out,), SPEC.env_id) == 0
 
 
@@ -235,8 +240,10 @@ def test_success_at_some_step_and_at_the_last_stand_in_every_report(tmp_path):
 
     protocol = Protocol(SPEC.env_id, SEEDS, num_envs=4, repetitions=1, videos=0)
     envs, console = EnvMaker(for_policy, lambda n, _: PointMass(n, chunk=None)), Console(file=io.StringIO(), width=160)
-    restless = [Contender("restless", TEACHER, "runs/teacher", Proportional(gain=2.0, noise_scale=0.9))]
-    (policy,) = judge(restless, protocol, envs, out, {}, COMMAND, console)["policies"]
+    restless = [EvaluatedPolicy("restless", TEACHER, "runs/teacher", Proportional(gain=2.0, noise_scale=0.9))]
+    results = evaluate_policies(restless, protocol, envs, out, {}, COMMAND, console)
+    show(results, out, console)
+    (policy,) = results["policies"]
     once, at_end = policy["success_once"], policy["success_at_end"]
     assert once["successes"] == policy["successes"] > at_end["successes"]
     assert at_end["ci95"] == list(rate_interval(at_end["successes"], len(SEEDS)))
@@ -250,11 +257,11 @@ def test_success_at_some_step_and_at_the_last_stand_in_every_report(tmp_path):
 def test_what_a_checkpoint_was_made_for_and_has_seen_is_told_everywhere(tmp_path):
     out = tmp_path / "report"
     origin = Origin.read("toy/b", {"data": {"env_id": SPEC.env_id, "demo_seeds": list(SEEDS[:2])}})
-    stranger = dataclasses.replace(contenders()[2], origin=origin)
+    stranger = dataclasses.replace(policies()[2], origin=origin)
     protocol = Protocol(SPEC.env_id, SEEDS[:4], num_envs=2, repetitions=1, videos=0)
     envs = EnvMaker(lambda policy, n, _: PointMass(n, policy.chunk), lambda n, _: PointMass(n, chunk=None))
     console = Console(file=io.StringIO(), width=80)
-    results = judge([contenders()[0], stranger], protocol, envs, out, {}, COMMAND, console)
+    results = evaluate_policies([policies()[0], stranger], protocol, envs, out, {}, COMMAND, console)
     assert results["seen_seeds"] == {"student": 2}
     seen, other = results["remarks"]
     assert "2 of the 4 seeds are those of its own demonstrations" in seen
@@ -269,10 +276,10 @@ def test_what_a_checkpoint_was_made_for_and_has_seen_is_told_everywhere(tmp_path
 
 
 def test_names_cannot_break_the_page(tmp_path):
-    hostile = dataclasses.replace(contenders()[0], name="<script>alert(1)</script>")
+    hostile = dataclasses.replace(policies()[0], name="<script>alert(1)</script>")
     protocol = Protocol(SPEC.env_id, SEEDS[:2], num_envs=2, repetitions=1, videos=1)
     envs = EnvMaker(lambda policy, n, _: PointMass(n, policy.chunk), lambda n, _: PointMass(n, chunk=None))
-    judge([hostile], protocol, envs, tmp_path / "r", {}, COMMAND, Console(file=io.StringIO()))
+    evaluate_policies([hostile], protocol, envs, tmp_path / "r", {}, COMMAND, Console(file=io.StringIO()))
     assert "<script>" not in (tmp_path / "r" / "report.html").read_text()
 
 
@@ -291,7 +298,7 @@ def test_a_senseless_protocol_is_refused():
 
 def test_a_policy_of_the_dp3_preset_is_told_the_option_that_it_needs():
     theirs = dataclasses.replace(SPEC, obs=dataclasses.replace(SPEC.obs, frame="dp3"))
-    contender = Contender("student", STUDENT, "runs/student", Proportional(spec=theirs))
+    evaluated = EvaluatedPolicy("student", STUDENT, "runs/student", Proportional(spec=theirs))
     with pytest.raises(SpecMismatchError, match=r"runs/student learnt from clouds .* add --obs-preset dp3"):
-        require_made_for(SPEC, [contender])
-    require_made_for(theirs, [contender])
+        require_made_for(SPEC, [evaluated])
+    require_made_for(theirs, [evaluated])

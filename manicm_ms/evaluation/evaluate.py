@@ -1,0 +1,149 @@
+"""Evaluate policies on the same held-out seeds: from checkpoints to a report, one stage after another."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+from rich.console import Console
+
+from manicm_ms.errors import ConfigError
+from manicm_ms.evaluation.latency import stored_or_measured
+from manicm_ms.evaluation.origins import remarks
+from manicm_ms.evaluation.play import EnvMaker, env_maker, play
+from manicm_ms.evaluation.policies import load_policies, require_playable
+from manicm_ms.evaluation.protocol import CLEAN, OBS_PRESET, EvaluatedPolicy, Protocol
+from manicm_ms.evaluation.records import claimed_folder
+from manicm_ms.evaluation.report import write_report
+from manicm_ms.evaluation.request import command_of, request_of
+from manicm_ms.evaluation.results import compile_results
+from manicm_ms.evaluation.video import film_pair
+from manicm_ms.machine.devices import resolve_device
+from manicm_ms.paths import write_json
+from manicm_ms.progress import working
+from manicm_ms.sensing.camera_model import read_camera
+from manicm_ms.sensing.realism import REALISM, parse_presets
+
+
+def evaluate(
+    checkpoints: Sequence[Path],
+    env_id: str,
+    episodes: int,
+    seed: int,
+    out: Path,
+    *,
+    num_envs: int | None = None,
+    backend: str = "auto",
+    device: str = "cpu",
+    control: bool = True,
+    videos: int = 4,
+    threads: int = 1,
+    repetitions: int = 50,
+    realism: str = CLEAN,
+    camera: Path | None = None,
+    obs_preset: str = OBS_PRESET,
+    allow_seen_seeds: bool = False,
+    to_the_end: bool = True,
+    command: str | None = None,
+    console: Console | None = None,
+) -> dict[str, Any]:
+    """Evaluate checkpoints on the same `episodes` held-out seeds and write results.json, report.md and report.html.
+
+    The same call goes on where an earlier one was stopped: finished episodes are on disk and are not played again.
+
+    Args:
+        checkpoints: checkpoint folders, the teacher first and the student last; one alone is evaluated without a pair.
+        env_id: environment, for example "ur3e/slide-block".
+        episodes: seeds seed, seed + 1, ..., seed + episodes - 1.
+        seed: the first seed, beyond those of the demonstrations.
+        out: folder of records and report.
+        num_envs: rows in parallel; None takes the machine's cores.
+        backend: of `make_vec`.
+        device: of the policies: "auto", "cpu", "cuda", "cuda:1".
+        control: add the teacher run in one step, without distillation, between teacher and student.
+        videos: seeds filmed for teacher and student.
+        threads: torch threads while policies act and latency is measured.
+        repetitions: timed decisions per policy.
+        realism: one or more presets, separated by commas: all policies play the same seeds under each of them.
+        camera: YAML file of the cell's depth camera, as in `make_vec`.
+        obs_preset: as in `make_vec`; the one of the demonstrations that the policies learnt from.
+        allow_seen_seeds: evaluate on seeds of a checkpoint's own demonstrations and say so; refused otherwise.
+        to_the_end: play on after a success that is certain, so that success at the end is known; False saves time.
+        command: the command line to print in the report; None writes the equivalent of this call.
+        console: where progress is shown; None is standard output.
+
+    Returns what results.json holds.
+
+    Raises ManicmError: an unknown name, a checkpoint that does not fit, another evaluation in `out`, a full disk.
+    """
+    from manicm_ms.envs.simulator import ENVS, SimulatorConfig
+    from manicm_ms.envs.vec_env import resolve_backend
+
+    entry, seeds, presets = ENVS.get(env_id), tuple(range(seed, seed + episodes)), parse_presets(realism)
+    rows = _rows(num_envs, episodes)
+    protocol = Protocol(env_id, seeds, rows, threads, repetitions, videos, presets, to_the_end, entry.seed_limit)
+    model = None if camera is None else read_camera(camera)
+    backend = resolve_backend(backend, entry)
+    for preset in presets:
+        entry.require(SimulatorConfig(realism=REALISM.get(preset), camera=model, obs_preset=obs_preset))
+    policies = load_policies(checkpoints, device := str(resolve_device(device)), control)
+    offered = SimulatorConfig(obs_preset=obs_preset).specialise(entry.spec)
+    require_playable(policies, offered, () if allow_seen_seeds else seeds)
+    request = request_of(protocol, policies, backend, device, model, obs_preset)
+    asked = (checkpoints, env_id, episodes, seed, out, realism, camera, obs_preset, allow_seen_seeds, to_the_end)
+    makers = env_maker(env_id, backend, model, obs_preset)
+    return evaluate_policies(
+        policies, protocol, makers, out, request, command or command_of(*asked), console or Console()
+    )
+
+
+def _rows(num_envs: int | None, episodes: int) -> int:
+    """Return how many rows play at once; raise ConfigError where there is no episode to play."""
+    from manicm_ms.envs.vec_env import default_num_envs
+
+    if episodes < 1:
+        raise ConfigError(f"--episodes must be at least 1, got {episodes}")
+    return min(default_num_envs() if num_envs is None else num_envs, episodes)
+
+
+def evaluate_policies(
+    policies: Sequence[EvaluatedPolicy],
+    protocol: Protocol,
+    envs: EnvMaker,
+    out: Path,
+    request: Mapping[str, Any],
+    command: str,
+    console: Console,
+) -> dict[str, Any]:
+    """Evaluate loaded policies; see `evaluate`, which loads them and makes real environments.
+
+    Args:
+        policies: teacher first, student last.
+        protocol: seeds and sizes.
+        envs: makes the vector envs.
+        out: folder of records and report.
+        request: plain JSON values that identify this evaluation in `out`.
+        command: the command line that reproduces it.
+        console: where progress is shown.
+    """
+    with claimed_folder(out, request):
+        for remark in remarks(policies, protocol.env_id, protocol.seeds):
+            console.print(remark, style="yellow", highlight=False, markup=False, soft_wrap=True)
+        with working(console, "time the decisions"):
+            latencies = stored_or_measured(
+                {p.name: p.policy for p in policies}, out / "latency.json",
+                repetitions=protocol.repetitions, threads=protocol.threads,
+            )  # fmt: skip
+        played = play(policies, protocol, envs, out, console)
+        results = compile_results(policies, protocol, played, latencies, command, envs.conditions)
+        _write(results, out)  # before filming, which may fail or be stopped
+        main, fps = played.by_preset[protocol.realism[0]], played.spec.action.control_hz
+        results["videos"] = film_pair(policies, protocol, envs, out, main, fps, console)
+        _write(results, out)
+    return results
+
+
+def _write(results: Mapping[str, Any], out: Path) -> None:
+    write_json(out / "results.json", results)
+    write_report(results, out)

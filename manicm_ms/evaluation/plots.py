@@ -1,0 +1,108 @@
+"""Plots of an evaluation as inline SVG that follows the page's colours."""
+
+from __future__ import annotations
+
+import io
+import re
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+from matplotlib.figure import Figure
+
+from manicm_ms.evaluation.results import INTERVALS
+from manicm_ms.evaluation.text import format_ms
+
+PAPER_LATENCY_MS = {"DP3, paper": 177.6, "ManiCM, paper": 17.3}
+"""Mean decision times on an RTX 4090, milliseconds: ManiCM (arXiv:2406.01586), table of results, last column."""
+
+ROLE_COLORS = {
+    "teacher": "#3b76c4",
+    "control": "#8c93a0",
+    "student": "#e07b39",
+    "policy": "#5b9a68",
+    "paper": "#b9bec7",
+}
+
+# Plots are drawn in this colour and then told to use the page's own, so that they follow light and dark.
+_INK = "#010203"
+
+
+def success_plot(results: Mapping[str, Any]) -> str:
+    """Return an SVG of the success rates with their 95 % intervals."""
+    policies = results["policies"]
+    figure, axes = _axes(len(policies))
+    for y, policy in enumerate(policies):
+        if policy["success_rate"] is None:
+            axes.text(1, y, "every episode crashed", va="center", color=_INK)
+            continue
+        rate, (low, high) = policy["success_rate"], policy["ci95"]
+        axes.barh(y, 100 * rate, color=ROLE_COLORS[policy["role"]], height=0.62)
+        error = [[100 * max(rate - low, 0)], [100 * max(high - rate, 0)]]
+        axes.errorbar(100 * rate, y, xerr=error, color=_INK, capsize=4, lw=1.4)
+        axes.text(103, y, f"{100 * rate:.1f} %", va="center", color=_INK)
+    axes.set_xlim(0, 100)
+    axes.set_xlabel(f"success rate, % (bar) with 95 % {INTERVALS['rate']} interval")
+    _label(axes, [p["name"] for p in policies])
+    return _svg(figure, "Success rate of each policy with its 95 % interval")
+
+
+def latency_plot(results: Mapping[str, Any]) -> str:
+    """Return an SVG of the decision times on a log scale, the paper's beside ours."""
+    ours = [(p["name"], p["latency_ms"]["median"], p["latency_ms"]["p95"], p["role"]) for p in results["policies"]]
+    theirs = [(name, value, None, "paper") for name, value in PAPER_LATENCY_MS.items()]
+    entries = ours + theirs
+    figure, axes = _axes(len(entries))
+    values = [value for _, value, _, _ in entries]
+    left = 10 ** _floor_log10(min(values) / 1.5)
+    for y, (_, median, p95, role) in enumerate(entries):
+        axes.barh(y, median - left, left=left, color=ROLE_COLORS[role], height=0.62)
+        if p95 is not None:
+            axes.plot([p95], [y], marker="|", ms=13, mew=1.6, color=_INK)
+        axes.text(max(median, p95 or 0) * 1.12, y, format_ms(median), va="center", color=_INK)
+    axes.set_xscale("log")
+    axes.xaxis.set_major_formatter(lambda value, _: f"{value:g}")
+    axes.set_xlim(left, 6 * max(values))
+    axes.set_xlabel("one decision, ms, log scale (bar: median, tick: p95; paper: mean on an RTX 4090)")
+    _label(axes, [name for name, *_ in entries])
+    return _svg(figure, "Wall time of one decision of each policy beside the paper's")
+
+
+def _floor_log10(value: float) -> int:
+    exponent = 0
+    while 10.0**exponent > value:
+        exponent -= 1
+    while 10.0 ** (exponent + 1) <= value:
+        exponent += 1
+    return exponent
+
+
+def _axes(bars: int) -> tuple[Figure, Any]:
+    figure = Figure(figsize=(7.4, 0.9 + 0.42 * bars), layout="constrained")
+    axes = figure.subplots()
+    axes.invert_yaxis()
+    axes.spines[["top", "right", "left"]].set_visible(False)
+    axes.spines["bottom"].set_color(_INK)
+    axes.tick_params(colors=_INK, which="both")
+    axes.xaxis.label.set_color(_INK)
+    axes.grid(axis="x", color=_INK, alpha=0.12, lw=0.8)
+    axes.set_axisbelow(True)
+    axes.patch.set_alpha(0)
+    return figure, axes
+
+
+def _label(axes: Any, names: Sequence[str]) -> None:
+    axes.set_yticks(range(len(names)), names)
+    axes.tick_params(axis="y", length=0)
+
+
+def _svg(figure: Figure, description: str) -> str:
+    """Return the figure as inline SVG whose text and lines take the page's colour."""
+    from matplotlib import rc_context
+
+    buffer = io.StringIO()
+    with rc_context({"svg.fonttype": "none", "svg.hashsalt": "manicm_ms", "font.size": 10}):
+        figure.savefig(buffer, format="svg", transparent=True, metadata={"Date": None})
+    svg = buffer.getvalue()
+    svg = svg[svg.index("<svg") :].replace(_INK, "currentColor")
+    svg = re.sub(r"<metadata>.*?</metadata>", "", svg, flags=re.DOTALL)
+    return svg.replace("<svg", f'<svg role="img" aria-label="{description}"', 1)
