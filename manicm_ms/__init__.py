@@ -15,13 +15,19 @@ signals.quiet_start("manicm-ms", "manicm_ms.cli")  # before the imports, in whic
 from manicm_ms import former_names, gym_ids  # noqa: E402
 
 __version__ = "0.1.0"
-__all__ = ["__version__", "check_vec_env", "make_vec"]
+__all__ = ["ChunkSpec", "EnvSpec", "__version__", "check_vec_env", "make_vec"]
 
 if TYPE_CHECKING:
     from manicm_ms.envs.conformance import check_vec_env
     from manicm_ms.envs.vec_env import make_vec
+    from manicm_ms.spec import ChunkSpec, EnvSpec
 
-_LAZY = {"make_vec": "manicm_ms.envs.vec_env", "check_vec_env": "manicm_ms.envs.conformance"}
+_LAZY = {
+    "make_vec": "manicm_ms.envs.vec_env",
+    "check_vec_env": "manicm_ms.envs.conformance",
+    "ChunkSpec": "manicm_ms.spec",
+    "EnvSpec": "manicm_ms.spec",
+}
 
 
 def __getattr__(name: str) -> Any:

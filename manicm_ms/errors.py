@@ -82,6 +82,10 @@ class CheckpointError(ManicmError):
     """A checkpoint folder that is missing, incomplete, altered or foreign."""
 
 
+class UserPolicyError(ManicmError):
+    """A policy of the user's own cannot be loaded, or does not return what an evaluation needs."""
+
+
 class OutputExistsError(ManicmError):
     """An output folder that already holds another run."""
 

@@ -111,11 +111,11 @@ def _import_or_leave_out(name: str) -> None:
         del _entered[before:]
         _left_out.add(name)
         spec = importlib.util.find_spec(name)
-        file, line, what = _where(error, spec.origin if spec and spec.origin else name)
+        file, line, what = where_it_failed(error, spec.origin if spec and spec.origin else name)
         warnings.warn(f"{file}, line {line}: {what}; its tasks are left out", TaskWarning, stacklevel=2)
 
 
-def _where(error: BaseException, origin: str) -> tuple[str, int, str]:
+def where_it_failed(error: BaseException, origin: str) -> tuple[str, int, str]:
     """Return file, line and words of what stopped the import of the file `origin`."""
     if isinstance(error, SyntaxError):
         return error.filename or origin, error.lineno or 1, f"{type(error).__name__}: {error.msg}"

@@ -201,8 +201,10 @@ def convert_command(
 
 
 def evaluate_command(
-    checkpoints: tyro.conf.Positional[tuple[Path, ...]],
+    checkpoints: tyro.conf.Positional[tuple[Path, ...]] = (),
+    *,
     env: str,
+    policy: tyro.conf.UseAppendAction[tuple[str, ...]] = (),
     out: Path = Path("runs/report"),
     episodes: Count = 100,
     seed: Seed = 100_000,
@@ -217,12 +219,14 @@ def evaluate_command(
     obs_preset: str = "manicm_ms",
     allow_seen_seeds: bool = False,
     to_the_end: bool = True,
+    colors: bool = False,
 ) -> int:
-    """Evaluate checkpoints on the same held-out seeds: success with intervals, paired difference, latency, report.
+    """Evaluate policies on the same held-out seeds: success with intervals, paired difference, latency, report.
 
     Args:
         checkpoints: checkpoint folders, the teacher first and the student last.
         env: environment id.
+        policy: a policy of your own, FILE.py:FUNCTION; may be repeated, and stand beside checkpoints.
         out: folder of results.json, report.md and report.html.
         episodes: held-out seeds, each played once by each policy.
         seed: first of them.
@@ -237,6 +241,7 @@ def evaluate_command(
         obs_preset: the one that the policies were trained with: manicm_ms or dp3.
         allow_seen_seeds: evaluate on seeds of a checkpoint's own demonstrations, which is refused otherwise.
         to_the_end: play on after a success that is certain, so that success at the last step is known too.
+        colors: coloured clouds for policies of your own; beside checkpoints they get the first one's clouds.
     """
     from rich.console import Console
 
@@ -245,10 +250,10 @@ def evaluate_command(
 
     console = Console()
     results = evaluate(
-        _at_least_one(checkpoints, "checkpoint folder"), env, episodes, seed, out, num_envs=num_envs, backend=backend,
+        checkpoints, env, episodes, seed, out, num_envs=num_envs, backend=backend,
         device=device, control=control, videos=videos, threads=threads, realism=realism,
         camera=camera, obs_preset=obs_preset, allow_seen_seeds=allow_seen_seeds, to_the_end=to_the_end,
-        command=this_command(), console=console,
+        policies=policy, colors=colors, command=this_command(), console=console,
     )  # fmt: skip
     return 0 if show(results, out, console) else 1
 

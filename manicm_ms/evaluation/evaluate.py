@@ -12,7 +12,7 @@ from manicm_ms.errors import ConfigError
 from manicm_ms.evaluation.latency import stored_or_measured
 from manicm_ms.evaluation.origins import remarks
 from manicm_ms.evaluation.play import EnvMaker, env_maker, play
-from manicm_ms.evaluation.policies import load_policies, require_playable
+from manicm_ms.evaluation.policies import load_policies, require_playable, with_users
 from manicm_ms.evaluation.protocol import CLEAN, OBS_PRESET, EvaluatedPolicy, Protocol
 from manicm_ms.evaluation.records import claimed_folder
 from manicm_ms.evaluation.report import write_report
@@ -45,6 +45,8 @@ def evaluate(
     obs_preset: str = OBS_PRESET,
     allow_seen_seeds: bool = False,
     to_the_end: bool = True,
+    policies: Sequence[str] = (),
+    colors: bool = False,
     command: str | None = None,
     console: Console | None = None,
 ) -> dict[str, Any]:
@@ -70,6 +72,8 @@ def evaluate(
         obs_preset: as in `make_vec`; the one of the demonstrations that the policies learnt from.
         allow_seen_seeds: evaluate on seeds of a checkpoint's own demonstrations and say so; refused otherwise.
         to_the_end: play on after a success that is certain, so that success at the end is known; False saves time.
+        policies: FILE.py:FUNCTION of each policy of the user's own, behind the checkpoints; see `UserPolicy`.
+        colors: give policies of the user's own coloured clouds; beside checkpoints they get the first one's clouds.
         command: the command line to print in the report; None writes the equivalent of this call.
         console: where progress is shown; None is standard output.
 
@@ -87,14 +91,27 @@ def evaluate(
     backend = resolve_backend(backend, entry)
     for preset in presets:
         entry.require(SimulatorConfig(realism=REALISM.get(preset), camera=model, obs_preset=obs_preset))
-    policies = load_policies(checkpoints, device := str(resolve_device(device)), control)
-    offered = SimulatorConfig(obs_preset=obs_preset).specialise(entry.spec)
-    require_playable(policies, offered, () if allow_seen_seeds else seeds)
-    request = request_of(protocol, policies, backend, device, model, obs_preset)
-    asked = (checkpoints, env_id, episodes, seed, out, realism, camera, obs_preset, allow_seen_seeds, to_the_end)
+    loaded = load_policies(checkpoints, device := str(resolve_device(device)), control)
+    offered = SimulatorConfig(obs_preset=obs_preset, colors=colors).specialise(entry.spec)
+    require_playable(loaded, offered, () if allow_seen_seeds else seeds)
+    evaluated = with_users(loaded, policies, offered)
+    request = request_of(protocol, evaluated, backend, device, model, obs_preset)
+    asked = (
+        checkpoints,
+        policies,
+        env_id,
+        episodes,
+        seed,
+        out,
+        realism,
+        camera,
+        obs_preset,
+        allow_seen_seeds,
+        to_the_end,
+    )
     makers = env_maker(env_id, backend, model, obs_preset)
     return evaluate_policies(
-        policies, protocol, makers, out, request, command or command_of(*asked), console or Console()
+        evaluated, protocol, makers, out, request, command or command_of(*asked), console or Console()
     )
 
 

@@ -6,18 +6,16 @@ import json
 import time
 from collections.abc import Mapping
 from pathlib import Path
-from typing import TYPE_CHECKING, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 import torch
 
 from manicm_ms.errors import ConfigError, OutputExistsError
+from manicm_ms.evaluation.decisions import Decider
 from manicm_ms.machine.devices import torch_threads
 from manicm_ms.paths import write_json
 from manicm_ms.spec import AGENT_POS, POINT_CLOUD, ChunkSpec, EnvSpec
-
-if TYPE_CHECKING:
-    from manicm_ms.policies.base import Policy
 
 
 class Latency(NamedTuple):
@@ -27,16 +25,16 @@ class Latency(NamedTuple):
         median_ms: median wall time, milliseconds.
         p95_ms: 95th percentile, milliseconds.
         n: timed decisions.
-        nfe: network evaluations per decision.
+        nfe: network evaluations per decision; None where the policy does not say.
         threads: torch's intra-op threads.
-        dtype: dtype of the parameters, for example "float32".
+        dtype: dtype of the parameters, for example "float32"; "-" where it is no torch module.
         device: "cpu" or the name of the CUDA device.
     """
 
     median_ms: float
     p95_ms: float
     n: int
-    nfe: int
+    nfe: int | None
     threads: int
     dtype: str
     device: str
@@ -56,7 +54,7 @@ def example_observation(spec: EnvSpec, chunk: ChunkSpec, seed: int = 0) -> dict[
 
 
 def measure_latency(
-    policies: Mapping[str, Policy],
+    policies: Mapping[str, Decider],
     *,
     repetitions: int = 50,
     warmup: int = 5,
@@ -86,17 +84,19 @@ def measure_latency(
         )
     observations = {name: example_observation(p.spec, p.chunk, seed) for name, p in policies.items()}
     times: dict[str, list[float]] = {name: [] for name in policies}
+    for policy in policies.values():
+        policy.eval()
     with torch_threads(threads), torch.inference_mode():
         for repetition in range(warmup + repetitions):
             for name, policy in policies.items():
-                elapsed = _time_decision(policy.eval(), observations[name], seed)
+                elapsed = _time_decision(policy, observations[name], seed)
                 if repetition >= warmup:
                     times[name].append(elapsed)
     return {name: _summary(policies[name], times[name], threads) for name in policies}
 
 
 def stored_or_measured(
-    policies: Mapping[str, Policy], path: Path, *, repetitions: int, threads: int
+    policies: Mapping[str, Decider], path: Path, *, repetitions: int, threads: int
 ) -> dict[str, Latency]:
     """Measure each policy, or read what an earlier call of the same evaluation measured and left at `path`.
 
@@ -123,13 +123,16 @@ def _stored(path: Path) -> dict[str, Latency]:
         raise OutputExistsError(f"{path} is damaged: delete it and latency is measured again") from error
 
 
-def _time_decision(policy: Policy, obs: Mapping[str, torch.Tensor], seed: int) -> float:
+def _time_decision(policy: Decider, obs: Mapping[str, torch.Tensor], seed: int) -> float:
     """Return the wall time of one decision, milliseconds."""
     device = policy.device
     generator = torch.Generator(device).manual_seed(seed)
+    shape = (policy.noise_draws, 1, policy.chunk.horizon, policy.spec.action.dim)
     _synchronize(device)
     start = time.perf_counter_ns()
-    policy.act({key: value.to(device) for key, value in obs.items()}, generator=generator).cpu()
+    noise = torch.randn(shape, generator=generator, device=device)
+    actions, _ = policy.decide({key: value.to(device) for key, value in obs.items()}, noise, None)
+    actions.cpu()
     _synchronize(device)
     return (time.perf_counter_ns() - start) / 1e6
 
@@ -140,7 +143,7 @@ def _synchronize(device: torch.device) -> None:
         torch.cuda.synchronize(device)
 
 
-def _summary(policy: Policy, times_ms: list[float], threads: int) -> Latency:
+def _summary(policy: Decider, times_ms: list[float], threads: int) -> Latency:
     device = policy.device
     return Latency(
         median_ms=float(np.median(times_ms)),
@@ -148,6 +151,11 @@ def _summary(policy: Policy, times_ms: list[float], threads: int) -> Latency:
         n=len(times_ms),
         nfe=policy.nfe,
         threads=threads,
-        dtype=str(next(policy.parameters()).dtype).removeprefix("torch."),
+        dtype=_dtype(policy),
         device=torch.cuda.get_device_name(device) if device.type == "cuda" else device.type,
     )
+
+
+def _dtype(policy: Decider) -> str:
+    first = next(policy.parameters(), None) if isinstance(policy, torch.nn.Module) else None
+    return "-" if first is None else str(first.dtype).removeprefix("torch.")

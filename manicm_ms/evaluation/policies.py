@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from dataclasses import replace
+from itertools import count
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -25,8 +26,6 @@ def load_policies(checkpoints: Sequence[Path], device: str = "cpu", control: boo
     from manicm_ms.policies.checkpoint import load_checkpoint, read_manifest
     from manicm_ms.policies.diffusion import DiffusionPolicy, OneStepTeacher
 
-    if not checkpoints:
-        raise ConfigError("name at least one checkpoint folder")
     paths = [Path(p) for p in checkpoints]
     names = [p.resolve().name for p in paths]
     if len(set(names)) < len(names):
@@ -37,12 +36,46 @@ def load_policies(checkpoints: Sequence[Path], device: str = "cpu", control: boo
     for name, path in zip(names, paths, strict=True):
         policy = load_checkpoint(path, device=device)
         origin = Origin.read(policy.spec.env_id, read_manifest(path)["provenance"])
-        policies.append(EvaluatedPolicy(name, role_of(policy), str(path), policy, origin))
-    first = policies[0]
-    if control and isinstance(first.policy, DiffusionPolicy):
-        one_step = replace(first, name=f"{first.name}, one step", role=CONTROL, policy=OneStepTeacher(first.policy))
-        policies.insert(1, one_step)
+        role, digest = role_of(policy), checkpoint_digest(str(path))
+        policies.append(EvaluatedPolicy(name, role, str(path), policy, origin, digest))
+    if control and policies and isinstance(teacher := policies[0].policy, DiffusionPolicy):
+        named = f"{policies[0].name}, one step"
+        policies.insert(1, replace(policies[0], name=named, role=CONTROL, policy=OneStepTeacher(teacher)))
     return policies
+
+
+def with_users(policies: Sequence[EvaluatedPolicy], sources: Sequence[str], spec: EnvSpec) -> list[EvaluatedPolicy]:
+    """Return the policies with those of the user's own behind them.
+
+    Args:
+        policies: loaded from checkpoints.
+        sources: FILE.py:FUNCTION of each of the user's.
+        spec: of the environment; theirs has the clouds of the first checkpoint, where there is one.
+
+    Raises:
+        UserPolicyError: one cannot be made, or its first actions are unfit.
+        ConfigError: there is no policy at all.
+    """
+    from manicm_ms.evaluation.user_policy import file_of, load_user_policy
+
+    if not policies and not sources:
+        raise ConfigError("name at least one checkpoint folder, or a policy of your own by --policy FILE.py:FUNCTION")
+    if policies:
+        seen = policies[0].policy.spec.obs
+        clouds = replace(spec.obs, num_points=seen.num_points, point_channels=seen.point_channels)
+        spec = replace(spec, obs=clouds)
+    found = list(policies)
+    for source in sources:
+        policy = load_user_policy(source, spec)
+        name = _free_name(policy.name, {p.name for p in found})
+        found.append(EvaluatedPolicy(name, OTHER, source, policy, digest=sha256(file_of(source))))
+    return found
+
+
+def _free_name(name: str, taken: Collection[str]) -> str:
+    """Return `name`, with a number behind it where it is taken."""
+    numbered = (f"{name} {k}" for k in count(2))
+    return name if name not in taken else next(n for n in numbered if n not in taken)
 
 
 def role_of(policy: Policy) -> str:
@@ -80,7 +113,11 @@ def require_made_for(spec: EnvSpec, policies: Sequence[EvaluatedPolicy]) -> None
             )
         # The environment is made with or without colours, as the policy wants.
         offered = replace(spec, obs=replace(spec.obs, point_channels=theirs.obs.point_channels))
-        require_compatible(offered, theirs, f"environment {spec.env_id}", f"checkpoint {evaluated.checkpoint}")
+        require_compatible(offered, theirs, f"environment {spec.env_id}", _called(evaluated))
+
+
+def _called(evaluated: EvaluatedPolicy) -> str:
+    return f"{'policy' if evaluated.role == OTHER else 'checkpoint'} {evaluated.checkpoint}"
 
 
 def checkpoint_digest(folder: str) -> str:

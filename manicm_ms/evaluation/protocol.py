@@ -13,6 +13,7 @@ from manicm_ms.seeds import require_seed
 from manicm_ms.sensing.realism import RealismSample
 
 if TYPE_CHECKING:
+    from manicm_ms.evaluation.user_policy import UserPolicy
     from manicm_ms.policies.base import Policy
 
 TEACHER, CONTROL, STUDENT, OTHER = "teacher", "control", "student", "policy"
@@ -72,16 +73,18 @@ class EvaluatedPolicy:
     Attributes:
         name: its name in tables and files, unique in the evaluation.
         role: what its checkpoint is, one of the four above.
-        checkpoint: folder it was loaded from, as the caller named it.
+        checkpoint: folder it was loaded from, as the caller named it; of a user's own policy FILE.py:FUNCTION.
         policy: the policy itself, on the device it shall run on.
         origin: what its checkpoint says of its making.
+        digest: tells what was loaded from something else under the same path.
     """
 
     name: str
     role: str
     checkpoint: str
-    policy: Policy
+    policy: Policy | UserPolicy
     origin: Origin = UNKNOWN
+    digest: str = ""
 
 
 def slug(name: str) -> str:

@@ -7,8 +7,16 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-from manicm_ms.evaluation.policies import checkpoint_digest
-from manicm_ms.evaluation.protocol import CLEAN, CONTROL, OBS_PRESET, STUDENT, TEACHER, EvaluatedPolicy, Protocol
+from manicm_ms.evaluation.protocol import (
+    CLEAN,
+    CONTROL,
+    OBS_PRESET,
+    OTHER,
+    STUDENT,
+    TEACHER,
+    EvaluatedPolicy,
+    Protocol,
+)
 from manicm_ms.sensing.camera_model import CameraModel
 from manicm_ms.sensing.realism import REALISM
 
@@ -28,7 +36,7 @@ def request_of(
         "episodes": len(protocol.seeds),
         "backend": backend,
         "device": device,
-        "policies": [[c.name, _place(i, c), checkpoint_digest(c.checkpoint)] for i, c in enumerate(policies)],
+        "policies": [[c.name, _place(i, c), c.digest] for i, c in enumerate(policies)],
         **_requested_realism(protocol.realism, camera),
         **({} if obs_preset == OBS_PRESET else {"obs_preset": obs_preset}),
     }
@@ -36,7 +44,7 @@ def request_of(
 
 def _place(index: int, policy: EvaluatedPolicy) -> str:
     """Return what folders of all versions call the place of a policy in the list; its role is another matter."""
-    return CONTROL if policy.role == CONTROL else STUDENT if index else TEACHER
+    return policy.role if policy.role in (CONTROL, OTHER) else STUDENT if index else TEACHER
 
 
 def _requested_realism(presets: tuple[str, ...], camera: CameraModel | None) -> dict[str, Any]:
@@ -51,6 +59,7 @@ def _requested_realism(presets: tuple[str, ...], camera: CameraModel | None) -> 
 
 def command_of(
     checkpoints: Sequence[Path],
+    policies: Sequence[str],
     env_id: str,
     episodes: int,
     seed: int,
@@ -64,6 +73,7 @@ def command_of(
     """Return the command line of `evaluate` with these arguments; those left at their default are left out."""
     flags = (["--allow-seen-seeds"] if allow_seen_seeds else []) + ([] if to_the_end else ["--no-to-the-end"])
     words = ["manicm-ms", "evaluate", *map(str, checkpoints), "--env", env_id]
+    words += [word for source in policies for word in ("--policy", source)]
     words += ["--obs-preset", obs_preset] if obs_preset != OBS_PRESET else []
     words += ["--realism", realism] if realism != CLEAN else []
     words += ["--camera", str(camera)] if camera is not None else []

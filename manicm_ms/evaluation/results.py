@@ -6,6 +6,8 @@ from collections.abc import Callable, Mapping, Sequence
 from functools import partial
 from typing import Any
 
+import torch
+
 from manicm_ms.evaluation.intervals import (
     CONFIDENCE,
     DIFFERENCE_METHOD,
@@ -188,9 +190,14 @@ def _policy_entry(
         "device": latency.device,
         "threads": latency.threads,
         "dtype": latency.dtype,
-        "parameters": sum(p.numel() for p in evaluated.policy.parameters()),
+        "parameters": _parameters(evaluated.policy),
         "episodes": _episode_entries(episodes, drawn),
     }
+
+
+def _parameters(policy: object) -> int | None:
+    """Return the number of parameters; None where the policy is no torch module."""
+    return sum(p.numel() for p in policy.parameters()) if isinstance(policy, torch.nn.Module) else None
 
 
 def _episode_entries(episodes: Sequence[EpisodeResult], drawn: Callable[[int], RealismSample]) -> list[dict[str, Any]]:

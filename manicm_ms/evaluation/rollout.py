@@ -12,18 +12,15 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 import torch
 
-from manicm_ms.errors import BackendError, ConfigError, NotFiniteError
+from manicm_ms.errors import BackendError, ConfigError
+from manicm_ms.evaluation.decisions import Decider, Decisions
 from manicm_ms.spec import ChunkSpec, require_compatible
 
 if TYPE_CHECKING:
     from manicm_ms.envs.vec_env import VecEnv
-    from manicm_ms.policies.base import Policy
 
 MAX_RESTARTS = 3
-"""Restarts of a dead env in a row, without an episode that ended by itself, before the roll-out gives up."""
-
-_NOISE_STREAM = 0x4D53
-"""Sets the policy's noise apart from whatever else is drawn from an episode's seed."""
+"""Restarts of a dead env in a row, without an episode that ended by itself, before the rollout gives up."""
 
 
 @dataclass(frozen=True)
@@ -126,7 +123,7 @@ def require_chunk(vec_env: VecEnv, chunk: ChunkSpec) -> None:
 
 def rollout(
     vec_env: VecEnv | RestartableEnv,
-    policy: Policy,
+    policy: Decider,
     seeds: Sequence[int],
     *,
     on_episode: Callable[[EpisodeResult], None] | None = None,
@@ -145,7 +142,7 @@ def rollout(
     4. A row whose simulation or policy fails (error in the env, also at its reset, or an action that is not
        finite) is a failed episode with its reason. If the env itself dies (BackendError), all episodes in
        flight are failed ones; a `RestartableEnv` is restarted and the remaining seeds go on, any other env ends the
-       roll-out with that error.
+       rollout with that error.
 
     Noise and initial state depend on the seed alone, hence the same seed meets two policies, or two
     values of num_envs, under the same conditions. With the same num_envs the results are bit-equal, in
@@ -175,17 +172,6 @@ def rollout(
     with torch.no_grad():
         results = _Rollout(vec_env, policy, seeds, on_episode, to_the_end).run()
     return [results[seed] for seed in seeds]
-
-
-def decision_noise(seed: int, decision: int, shape: tuple[int, ...]) -> torch.Tensor:
-    """Return the Gaussian noise, float32 on the CPU, of one decision of the episode with this seed.
-
-    A shorter leading axis gives the beginning of a longer one: policies that draw once and policies that
-    draw several times start from the same array.
-    """
-    state = np.random.SeedSequence((seed, _NOISE_STREAM, decision)).generate_state(1, np.uint64)[0]
-    generator = torch.Generator().manual_seed(int(state) >> 1)  # torch takes 63 bits without wrapping
-    return torch.stack([torch.randn(shape[1:], generator=generator) for _ in range(shape[0])])
 
 
 class _Episode:
@@ -220,7 +206,7 @@ class _Rollout:
     def __init__(
         self,
         vec_env: VecEnv | RestartableEnv,
-        policy: Policy,
+        policy: Decider,
         seeds: Sequence[int],
         on_episode: Callable[[EpisodeResult], None] | None,
         to_the_end: bool,
@@ -231,6 +217,7 @@ class _Rollout:
         self.pending = deque(int(s) for s in seeds)
         self.rows: list[_Episode | None] = [None] * self.env.num_envs
         self.results: dict[int, EpisodeResult] = {}
+        self.decisions = Decisions(policy, self.env.num_envs)
         self.obs: Mapping[str, torch.Tensor] | None = None  # None until the env's first reset
         self.restarts = 0
 
@@ -241,7 +228,7 @@ class _Rollout:
                 self._start_episodes()
                 self._play(self._decide())
             except BackendError as error:
-                self._bury_env(error)
+                self._replace_env(error)
         return self.results
 
     def _start_episodes(self) -> None:
@@ -257,6 +244,7 @@ class _Rollout:
         spare = next(e.seed for e in self.rows if e is not None)
         seeds = [spare if e is None else e.seed for e in self.rows]
         self.obs, info = self.env.reset(seed=seeds, options={"reset_mask": mask})
+        self.decisions.restart(np.flatnonzero(mask).tolist())
         for i in np.flatnonzero(fresh).tolist():
             if (error := info["error"][i]) is not None:
                 self._end(i, _Outcome(crashed=error))
@@ -264,11 +252,10 @@ class _Rollout:
     def _decide(self) -> torch.Tensor:
         """Return actions (N, Ta, Da); end the episodes of rows whose action is not finite."""
         assert self.obs is not None
-        device = self.policy.device
-        obs = {key: value.to(device) for key, value in self.obs.items()}
-        actions = self._act(obs, self._noise().to(device))
+        asked = [None if e is None else (e.seed, len(e.actions)) for e in self.rows]
+        actions = self.decisions.actions(self.obs, asked)
         finite = torch.isfinite(actions).flatten(1).all(1).cpu()
-        actions = torch.where(finite.to(device)[:, None, None], actions, torch.zeros_like(actions))
+        actions = torch.where(finite.to(actions.device)[:, None, None], actions, torch.zeros_like(actions))
         played = actions.float().cpu().numpy()
         for i, episode in enumerate(self.rows):
             if episode is None:
@@ -278,29 +265,6 @@ class _Rollout:
             else:
                 self._end(i, _Outcome(crashed=f"the policy's action {len(episode.actions)} is not finite"))
         return actions.to(self.env.device)
-
-    def _act(self, obs: Mapping[str, torch.Tensor], noise: torch.Tensor) -> torch.Tensor:
-        """Return the policy's actions (N, Ta, Da), NaN in rows that it refuses to act in."""
-        try:
-            return self.policy.act(obs, noise=noise)
-        except NotFiniteError as error:
-            refused = list(error.rows)
-        sound = next((i for i in range(len(self.rows)) if i not in refused), None)
-        if sound is None:
-            shape = (len(self.rows), self.policy.chunk.n_action_steps, self.policy.spec.action.dim)
-            return torch.full(shape, torch.nan, device=self.policy.device)
-        # A row does not depend on the others, so that a sound one can stand in for those that are refused.
-        rows = [sound if i in refused else i for i in range(len(self.rows))]
-        actions = self._act({key: value[rows] for key, value in obs.items()}, noise[:, rows]).clone()
-        actions[refused] = torch.nan
-        return actions
-
-    def _noise(self) -> torch.Tensor:
-        """Return noise (noise_draws, N, Tp, Da): row i of its episode's seed, zeros where there is no episode."""
-        policy = self.policy
-        shape = (policy.noise_draws, policy.chunk.horizon, policy.spec.action.dim)
-        rows = [torch.zeros(shape) if e is None else decision_noise(e.seed, len(e.actions), shape) for e in self.rows]
-        return torch.stack(rows, dim=1)
 
     def _play(self, actions: torch.Tensor) -> None:
         if not any(self.rows):
@@ -333,7 +297,7 @@ class _Rollout:
         if self.on_episode is not None:
             self.on_episode(result)
 
-    def _bury_env(self, error: BackendError) -> None:
+    def _replace_env(self, error: BackendError) -> None:
         """Fail the episodes in flight and restart the env, or raise where that cannot help."""
         if self.home is None:
             raise error

@@ -42,7 +42,7 @@ def _row(policy: Mapping[str, Any]) -> Row:
     return Row(
         name=policy["name"],
         role=policy["role"],
-        nfe=str(policy["nfe"]),
+        nfe=NOTHING if policy["nfe"] is None else str(policy["nfe"]),
         success=success_text(policy),
         interval=interval_text(policy["ci95"]),
         once=_count_text(policy.get("success_once")),
@@ -89,10 +89,9 @@ def paired_sentences(results: Mapping[str, Any]) -> list[str]:
         f"({method}, 95 %: {100 * low:+.1f} to {100 * high:+.1f}; McNemar's exact test p = {pair['mcnemar_p']:.3g}).",
     ]
     first, second = results["policies"][0]["latency_ms"]["median"], results["policies"][-1]["latency_ms"]["median"]
-    sentences.append(
-        f"The policy {pair['second']} decides {first / second:.1f} times as fast as {pair['first']}: "
-        f"{results['policies'][-1]['nfe']} against {results['policies'][0]['nfe']} network evaluations a decision."
-    )
+    evaluations = [results["policies"][k]["nfe"] for k in (-1, 0)]
+    why = "" if None in evaluations else ": {} against {} network evaluations a decision".format(*evaluations)
+    sentences.append(f"The policy {pair['second']} decides {first / second:.1f} times as fast as {pair['first']}{why}.")
     return sentences
 
 

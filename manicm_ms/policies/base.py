@@ -56,8 +56,28 @@ class Policy(nn.Module, ABC):
 
     @property
     def noise_draws(self) -> int:
-        """Independent Gaussian arrays (B, Tp, Da) that one `act` consumes."""
+        """Independent Gaussian arrays (B, Tp, Da) that one `act` consumes; 0 for a deterministic policy."""
         return 1
+
+    def initial_state(self, n: int) -> dict[str, Tensor] | None:
+        """Return what the policy remembers in n rows that have just been restarted; None without memory."""
+        del n
+        return None
+
+    def decide(
+        self, obs: Mapping[str, Tensor], noise: Tensor, state: dict[str, Tensor] | None
+    ) -> tuple[Tensor, dict[str, Tensor] | None]:
+        """Choose the next actions of rows whose episodes go on: what a rollout calls.
+
+        Args:
+            obs: as for `act`.
+            noise: (noise_draws, B, Tp, Da).
+            state: what the last decision returned, None at the first; a policy without memory ignores it.
+
+        Returns:
+            (B, Ta, Da) as `act` returns it, and the state after the decision.
+        """
+        return self.act(obs, noise=noise), state
 
     @abstractmethod
     def config_dict(self) -> dict[str, Any]:

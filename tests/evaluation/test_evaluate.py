@@ -225,11 +225,11 @@ def test_where_every_episode_crashed_there_is_no_rate(tmp_path, monkeypatch):
         assert "3 = -" in text
         assert "0.0 %" not in text
     monkeypatch.setattr("manicm_ms.evaluation.evaluate.evaluate", lambda *args, **options: results)
-    assert evaluate_command((out,), SPEC.env_id) == 1, "the exit status"
+    assert evaluate_command((out,), env=SPEC.env_id, out=out) == 1, "the exit status"
     mixed, _ = run(tmp_path / "mixed", seeds=seeds, crash_at=dict.fromkeys(seeds[:2], 1), videos=0)
     assert without_rate(mixed) == []
     monkeypatch.setattr("manicm_ms.evaluation.evaluate.evaluate", lambda *args, **options: mixed)
-    assert evaluate_command((out,), SPEC.env_id) == 0
+    assert evaluate_command((out,), env=SPEC.env_id, out=out) == 0
 
 
 def test_success_at_some_step_and_at_the_last_stand_in_every_report(tmp_path):

@@ -10,7 +10,8 @@ import torch
 from point_mass import CHUNK, DT, REACH, SPEC, PointMass, Proportional
 
 from manicm_ms.errors import BackendError, ConfigError, SpecMismatchError
-from manicm_ms.evaluation.rollout import MAX_RESTARTS, EpisodeResult, RestartableEnv, decision_noise, rollout
+from manicm_ms.evaluation.decisions import decision_noise
+from manicm_ms.evaluation.rollout import MAX_RESTARTS, EpisodeResult, RestartableEnv, rollout
 from manicm_ms.machine.devices import torch_threads
 from manicm_ms.policies.base import make_policy
 from manicm_ms.policies.finite import require_finite_actions
