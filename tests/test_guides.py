@@ -1,6 +1,7 @@
 """Every command that the README and the docs show is one that `manicm-ms` takes; the guide's Python runs."""
 
 import functools
+import json
 import re
 import shlex
 from pathlib import Path
@@ -9,6 +10,8 @@ import pytest
 import tyro
 
 from manicm_ms.cli import _PLAIN, _WITH_PRESET, PROGRAM, _command
+from manicm_ms.evaluation.user_policy import load_user_policy
+from manicm_ms.spec import EnvSpec
 
 REPO = Path(__file__).parents[1]
 PAGES = [REPO / "README.md", *sorted((REPO / "docs").rglob("*.md"))]
@@ -67,3 +70,11 @@ def test_the_python_of_train_and_evaluate_runs(monkeypatch, capsys):
     monkeypatch.chdir(REPO)
     exec(block, {})
     assert capsys.readouterr().out.strip() == "(1, 3, 7)"
+
+
+def test_the_policy_of_the_guide_is_one_that_evaluate_takes(tmp_path):
+    (block,) = code(REPO / "docs/guides/evaluate_your_own_policy.md", ("python",))
+    (tmp_path / "push_forward.py").write_text(block)
+    spec = EnvSpec.from_dict(json.loads((REPO / "checkpoints/slide_block/student/config.json").read_text())["env_spec"])
+    policy = load_user_policy(f"{tmp_path}/push_forward.py:make_policy", spec)
+    assert (policy.name, policy.chunk.n_action_steps) == ("push_forward", 3)
