@@ -1,4 +1,4 @@
-"""manicm_ms: one-step 3D manipulation policies and the parallel simulation to judge them in.
+"""manicm_ms: one-step 3D manipulation policies and the parallel simulation to evaluate them in.
 
 Importing this package makes its ids known to Gymnasium (`gymnasium.make("UR3eStackCube-v1")`) and loads no simulator;
 making an environment does.

@@ -1,4 +1,4 @@
-"""The jobs of a benchmark: collect, train, judge. Each is resumable, runs once, and leaves one result file when done.
+"""The jobs of a benchmark: collect, train, evaluate. Each resumes, runs once, and leaves one result file when done.
 
 ::
 
@@ -6,7 +6,7 @@
     out/metaworld/reach/collect.json
     out/metaworld/reach/seed0/simple_dp3/checkpoint/     and checkpoint.train/
     out/metaworld/reach/seed0/simple_dp3/train.json
-    out/metaworld/reach/seed0/simple_dp3/judge.json      episodes on fresh seeds, evaluations during training
+    out/metaworld/reach/seed0/simple_dp3/judge.json      episodes on held-out seeds, evaluations during training
     out/metaworld/reach/seed0/simple_dp3/judge.lock      held by the process that works on it
     out/metaworld/reach/seed0/simple_dp3/judge.failed.json   only where it failed; the next run tries again
 """
@@ -179,8 +179,8 @@ class TrainJob(Job):
 
 
 @dataclass(frozen=True)
-class JudgeJob(Job):
-    """Plays one method with one seed: the fresh seeds, and the evaluations during its training."""
+class EvaluateJob(Job):
+    """Plays one method with one seed: the held-out seeds, and the evaluations during its training."""
 
     env_id: str
     seed: int
@@ -277,5 +277,5 @@ def all_jobs(plan: Plan) -> tuple[Job, ...]:
     for seed in plan.seeds:
         for env_id in plan.env_ids:
             for method in plan.parsed_methods:
-                add(JudgeJob(plan, env_id, seed, method))
+                add(EvaluateJob(plan, env_id, seed, method))
     return tuple(found.values())

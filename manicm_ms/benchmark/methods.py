@@ -24,7 +24,7 @@ class Training(NamedTuple):
 
     Attributes:
         data: store of demonstrations.
-        preset: name of the recipes for teacher and student.
+        preset: name of the presets of teacher and student.
         seed: of the training.
         device: torch device.
         snapshots: checkpoints to keep on the way.

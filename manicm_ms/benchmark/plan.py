@@ -37,7 +37,7 @@ class Plan:
         demo_seed: first seed of the demonstrations.
         colors: with coloured clouds.
         obs_preset: as in `make_vec`.
-        episodes: fresh seeds that each trained policy plays.
+        episodes: held-out seeds that each trained policy plays.
         eval_seed: the first of them.
         evaluations: evaluations during training, for the paper's mean of the five highest; 0 leaves it out.
         evaluation_episodes: episodes of each.
@@ -85,17 +85,17 @@ class Plan:
         _ = self.parsed_methods
 
     def require_unseen(self, demonstrated: Sequence[int]) -> None:
-        """Raise ConfigError where a seed that is to judge a policy is among those of its demonstrations."""
-        judging = {s for seeds in self._judging_seeds for s in seeds}
-        if shared := judging & set(demonstrated):
+        """Raise ConfigError where a seed that a policy is to be evaluated on is among those of its demonstrations."""
+        held_out = {s for seeds in self._held_out_seeds for s in seeds}
+        if shared := held_out & set(demonstrated):
             raise ConfigError(
-                f"seed {min(shared)} is that of a demonstration and would judge the policies as well: choose "
+                f"seed {min(shared)} is that of a demonstration and would evaluate the policies as well: choose "
                 "--eval-seed and --demo-seed apart"
             )
 
     def require_seeds_of(self, entry: EnvEntry) -> None:
         """Raise ConfigError where a seed that is to be played lies beyond those that the environment takes."""
-        last = max(s for seeds in self._judging_seeds for s in (seeds[0], seeds[-1]))
+        last = max(s for seeds in self._held_out_seeds for s in (seeds[0], seeds[-1]))
         if last >= entry.seed_limit:
             raise ConfigError(
                 f"seeds of {entry.spec.env_id} end at {entry.seed_limit - 1}, and the fresh ones with those of the "
@@ -103,7 +103,7 @@ class Plan:
             )
 
     @property
-    def _judging_seeds(self) -> list[range]:
+    def _held_out_seeds(self) -> list[range]:
         return [self.fresh_seeds, *(self.evaluation_seeds(k) for k in range(self.evaluations))]
 
     @property
@@ -113,7 +113,7 @@ class Plan:
 
     @property
     def fresh_seeds(self) -> range:
-        """Seeds that judge every policy, never seen in training."""
+        """Seeds that every policy is evaluated on, never seen in training."""
         return range(self.eval_seed, self.eval_seed + self.episodes)
 
     def evaluation_seeds(self, number: int) -> range:

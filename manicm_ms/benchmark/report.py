@@ -37,12 +37,12 @@ class TextTable(NamedTuple):
 
 
 def main_table(results: Mapping[str, Any]) -> TextTable:
-    """Return success by group and average on fresh seeds, with the 95 % interval, NFE and time of a decision."""
+    """Return success by group and average on held-out seeds, with the 95 % interval, NFE and time of a decision."""
 
     def shown(entry: Mapping[str, Any]) -> str:
         return f"{_percent(entry['success_rate'])} ({_interval(entry['ci95'])})"
 
-    return _by_group(results, "Success on fresh seeds, % (95 % interval)", shown)
+    return _by_group(results, "Success on held-out seeds, % (95 % interval)", shown)
 
 
 def training_table(results: Mapping[str, Any]) -> TextTable | None:
@@ -119,7 +119,7 @@ def task_table(results: Mapping[str, Any]) -> TextTable:
     for env_id in results["env_ids"]:
         mine = [cells[env_id, method] for method in methods]
         lines.append((env_id, mine[0]["group"], *(_counted(c) for c in mine)))
-    return TextTable("By task, fresh seeds", ("task", "group", *methods), lines)
+    return TextTable("By task, held-out seeds", ("task", "group", *methods), lines)
 
 
 def _counted(cell: Mapping[str, Any]) -> str:

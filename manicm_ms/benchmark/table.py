@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from rich.console import Console
 
-from manicm_ms.benchmark.jobs import CollectJob, JudgeJob, TrainJob
+from manicm_ms.benchmark.jobs import CollectJob, EvaluateJob, TrainJob
 from manicm_ms.benchmark.methods import Method
 from manicm_ms.benchmark.plan import HIGHEST, Plan
 from manicm_ms.benchmark.summary import INTERVALS, SCHEMA_VERSION, cell_rates, group_of, mean_known, summarise
@@ -29,7 +29,7 @@ def measure_decisions(plan: Plan, console: Console, repetitions: int = 30) -> No
     """
     for env_id in plan.env_ids:
         path = plan.folder(env_id) / "latency.json"
-        jobs = [JudgeJob(plan, env_id, plan.seeds[0], method) for method in plan.parsed_methods]
+        jobs = [EvaluateJob(plan, env_id, plan.seeds[0], method) for method in plan.parsed_methods]
         wanted = {job.method.folder for job in jobs}
         if path.is_file() and set(json.loads(path.read_text(encoding="utf-8"))["methods"]) >= wanted:
             continue
@@ -65,20 +65,20 @@ def compile_table(plan: Plan, command: str) -> dict[str, Any]:
         **summarise(cells, plan.env_ids, plan.parsed_methods),
         "intervals": INTERVALS,
         "demonstrations": [_demonstrations(plan, env_id) for env_id in plan.env_ids],
-        "missing": [_missing(job) for job in _judge_jobs(plan) if not _is_measured(job)],
+        "missing": [_missing(job) for job in _evaluate_jobs(plan) if not _is_measured(job)],
     }
 
 
-def _judge_jobs(plan: Plan) -> Iterable[JudgeJob]:
-    return (JudgeJob(plan, e, s, m) for e in plan.env_ids for s in plan.seeds for m in plan.parsed_methods)
+def _evaluate_jobs(plan: Plan) -> Iterable[EvaluateJob]:
+    return (EvaluateJob(plan, e, s, m) for e in plan.env_ids for s in plan.seeds for m in plan.parsed_methods)
 
 
-def _is_measured(job: JudgeJob) -> bool:
+def _is_measured(job: EvaluateJob) -> bool:
     """Return whether it is done and any of its episodes was played to an end: crashes alone are no rate."""
     return job.is_done() and any(episode["crashed"] is None for episode in job.result()["episodes"])
 
 
-def _missing(job: JudgeJob) -> dict[str, str]:
+def _missing(job: EvaluateJob) -> dict[str, str]:
     reason = "not done yet"
     if job.is_done():
         first = job.result()["episodes"][0]
@@ -98,7 +98,7 @@ def _needs(job: Any) -> list[Any]:
 
 def _cell(plan: Plan, env_id: str, method: Method) -> dict[str, Any]:
     """Return the results of one method on one task, over the training seeds that are done."""
-    jobs = [job for seed in plan.seeds if _is_measured(job := JudgeJob(plan, env_id, seed, method))]
+    jobs = [job for seed in plan.seeds if _is_measured(job := EvaluateJob(plan, env_id, seed, method))]
     results = [job.result() for job in jobs]
     seeds = [str(job.seed) for job in jobs]
     outcomes, once, at_end = (_outcomes(results, seeds, key) for key in ("success", "success_once", "success_at_end"))

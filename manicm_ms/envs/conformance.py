@@ -1,4 +1,4 @@
-"""`check_vec_env`: the promises of `VecEnv`, checked on a real environment, one named property at a time."""
+"""`check_vec_env`: the contract of `VecEnv`, checked on a real environment, one named property at a time."""
 
 from __future__ import annotations
 
@@ -21,10 +21,10 @@ _EVERY_KEY = (POINT_CLOUD, AGENT_POS, STATE, DEPTH, IMAGE)
 
 @dataclass(frozen=True)
 class Property:
-    """Whether one promise holds.
+    """Whether one check passed.
 
     Attributes:
-        name: the promise, in a few words.
+        name: the check, in a few words.
         passed: whether it holds.
         detail: what was seen where it does not, or why it was not looked at.
     """
@@ -35,11 +35,11 @@ class Property:
 
 
 class ViolationError(Exception):
-    """A promise that does not hold."""
+    """A check that failed."""
 
 
-class NotPromisedError(Exception):
-    """A promise that the environment's backend does not make."""
+class NotApplicableError(Exception):
+    """A check that does not apply to the environment's backend."""
 
 
 def _require(holds: bool | Tensor, otherwise: str) -> None:
@@ -69,7 +69,7 @@ class _Checks:
         frames += [env.step(action)[0] for action in self._actions(env)]
         return frames
 
-    def _promised(self, frames: list[Obs]) -> list[Obs]:
+    def _comparable(self, frames: list[Obs]) -> list[Obs]:
         """Return those frames of an episode that its seed decides bit for bit.
 
         All on a CPU; in the rows of a GPU batch, which share a scene, the first one (docs/decisions/0010).
@@ -100,15 +100,15 @@ class _Checks:
 
     def same_seed_same_episode(self) -> None:
         """Playing the same seeds again gives the same frames."""
-        again = self._promised(self._play(self.env, _SEEDS))
-        _assert_equal(self._promised(self._episode), again, "a second run of the same seeds")
+        again = self._comparable(self._play(self.env, _SEEDS))
+        _assert_equal(self._comparable(self._episode), again, "a second run of the same seeds")
 
     def seed_decides_whatever_num_envs(self) -> None:
         """A seed gives the same frames alone in another process as beside others."""
         alone = self._make(1, obs=_EVERY_KEY)
         try:
-            second = [{k: v[1:] for k, v in frame.items()} for frame in self._promised(self._episode)]
-            played = self._promised(self._play(alone, _SEEDS[1:]))
+            second = [{k: v[1:] for k, v in frame.items()} for frame in self._comparable(self._episode)]
+            played = self._comparable(self._play(alone, _SEEDS[1:]))
             _assert_equal(second, played, "the second seed alone, in another environment,")
         finally:
             alone.close()
@@ -143,7 +143,7 @@ class _Checks:
     def unreset_row_goes_on(self) -> None:
         """The row left alone by a partial reset continues as if nothing had happened."""
         if self.env.backend != "cpu":
-            raise NotPromisedError("not looked at: rows of a gpu batch repeat their start, not their episode")
+            raise NotApplicableError("not looked at: rows of a gpu batch repeat their start, not their episode")
         actions = self._actions(self.env)
         self.env.reset(seed=list(_SEEDS))
         for k in range(3):
@@ -207,7 +207,7 @@ class _Checks:
         _require(info["clipped"].tolist() == [1, 1], f"info['clipped'] is {info['clipped'].tolist()}, not [1, 1]")
 
     def info_complete(self) -> None:
-        """Every info holds the promised names, shapes and dtypes."""
+        """Every info holds the documented names, shapes and dtypes."""
         _, reset_info = self.env.reset(seed=list(_SEEDS))
         *_, info = self.env.step(self._actions(self.env)[0])
         for facts in (reset_info, info):
@@ -282,7 +282,7 @@ PROPERTIES: tuple[Callable[[_Checks], None], ...] = (
 def check_vec_env(
     env_id: str, backend: str = "auto", on_result: Callable[[Property], None] = lambda _: None
 ) -> list[Property]:
-    """Check the promises of `VecEnv` on an environment id, by playing it.
+    """Check the contract of `VecEnv` on an environment id, by playing it.
 
     Checked are: it plays at all; spaces and dtypes; finite observations; the same seed gives the same episode, again,
     alone and in another environment; seeds differ; observations answer to actions and share no memory; a partial reset
@@ -290,7 +290,7 @@ def check_vec_env(
     bad seeds and unknown reset options are refused; the last seed decides later resets; info is complete; a chunk
     equals its single steps; the time limit truncates and freezes; closing twice is harmless.
 
-    On the cpu backend episodes are compared whole and bit for bit. On the gpu backend a seed promises the same start
+    On the cpu backend episodes are compared whole and bit for bit. On the gpu backend a seed fixes the same start
     (docs/decisions/0010): the properties about equal episodes then compare the first frame alone, and "unreset row
     goes on" is passed with the reason in its detail.
 
@@ -300,7 +300,7 @@ def check_vec_env(
         on_result: called with each property as soon as it is known.
 
     Returns:
-        one `Property` a promise, in a fixed order; only the first one where it does not play.
+        one `Property` a check, in a fixed order; only the first one where it does not play.
 
     Raises:
         UnknownNameError, BackendError, RenderDeviceError: see `make_vec`.
@@ -322,7 +322,7 @@ def _run(check: Callable[[_Checks], None], checks: _Checks) -> Property:
     name = check.__name__.replace("_", " ")
     try:
         check(checks)
-    except NotPromisedError as reason:
+    except NotApplicableError as reason:
         return Property(name, True, str(reason))
     except (ViolationError, ManicmError) as error:
         return Property(name, False, str(error))

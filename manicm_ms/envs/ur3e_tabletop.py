@@ -85,8 +85,8 @@ class UR3eTabletopEnv(RestorableEnv):
     """A UR3e with an AG-95 on a table, whose top is z = 0 in each row's world.
 
     The base stands at the origin, world frame = base frame, unless `reset(options={"reconfigure": True, "realism":
-    RealismRows})` draws a table height: then it stands that much lower. Tasks place and judge objects in the world;
-    what observations and privileged state tell is in the base frame.
+    RealismRows})` draws a table height: then it stands that much lower. Tasks place objects and test success in the
+    world; what observations and privileged state tell is in the base frame.
 
     A task defines `_load_objects`, `_place_objects`, `evaluate` and `reward_terms`, and the class attributes below.
 

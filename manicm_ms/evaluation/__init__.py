@@ -1,1 +1,1 @@
-"""Judging policies: roll-outs, latency, statistics, reports."""
+"""Evaluating policies: rollouts, latency, statistics, reports."""

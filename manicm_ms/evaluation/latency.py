@@ -1,4 +1,4 @@
-"""Wall time of one decision: observation in, action out, measured apart from any roll-out."""
+"""Wall time of one decision: observation in, action out, measured apart from any rollout."""
 
 from __future__ import annotations
 

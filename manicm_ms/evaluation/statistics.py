@@ -81,7 +81,7 @@ def mean_of_highest(rates: Sequence[float], count: int = 5) -> float:
     """Return the paper's score: the mean of the `count` highest evaluations during a training.
 
     ManiCM and DP3 report it with count = 5 over evaluations of 20 episodes each. Selecting the highest
-    biases it upward (about 10 points at 20 episodes), so it stands beside a rate on fresh seeds and
+    biases it upward (about 10 points at 20 episodes), so it stands beside a rate on held-out seeds and
     never replaces it.
     """
     if count < 1 or len(rates) < count:

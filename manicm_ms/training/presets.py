@@ -1,4 +1,4 @@
-"""Recipes for teachers and students: everything that decides a training, named, documented and overridable."""
+"""Presets of teachers and students: everything that decides a training, named, documented and overridable."""
 
 from __future__ import annotations
 
@@ -98,7 +98,7 @@ _ADDED_LATER = {"acting_points": "prefix", "training_points": "random"}
 
 
 def preset_identity(preset: FitConfig) -> dict[str, Any]:
-    """Return the fields that tell one recipe from another, JSON values.
+    """Return the fields that tell one preset from another, JSON values.
 
     A field that was added later is left out where it says what was done before, so that older runs still are the same
     run: they go on, or are found finished.

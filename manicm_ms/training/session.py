@@ -86,7 +86,7 @@ class Session:
     Attributes:
         kind: "teacher" or "student", for messages.
         out: checkpoint folder to write.
-        preset: all fields of the recipe.
+        preset: all of its fields.
         precision: the one used, resolved.
         seed: of weights, batches and noise.
         fabric: device and processes, launched.

@@ -44,7 +44,7 @@ def distill(
         teacher: checkpoint folder of a diffusion policy.
         data: store of demonstrations, as a rule the one that the teacher was trained on.
         out: checkpoint folder to write; state and logs go to `<out>.train`.
-        preset: the recipe.
+        preset: how to distil.
         device: "auto", "cpu", "cuda", "cuda:1".
         precision: one of `PRECISIONS`; None takes the preset's.
         seed: of point subsets, batches and noise.

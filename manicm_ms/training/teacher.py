@@ -39,7 +39,7 @@ def train_teacher(
         policy_name: a policy tagged "teacher" in `POLICIES`: "dp3", "simple_dp3".
         data: store of demonstrations.
         out: checkpoint folder to write; state and logs go to `<out>.train`.
-        preset: the recipe.
+        preset: how to train.
         device: "auto", "cpu", "cuda", "cuda:1".
         precision: one of `PRECISIONS`; None takes the preset's.
         seed: of weights, batches and noise.

@@ -98,7 +98,7 @@ def test_no_episode_of_an_evaluation_is_played_by_another_one_or_among_the_fresh
 def test_every_job_stands_after_those_it_needs_and_once():
     jobs = all_jobs(plan())
     names = [job.name for job in jobs]
-    assert len(set(names)) == len(names) == 2 + 2 * 2 * (2 + 3), "collect per task; 2 trainings, 3 judged per seed"
+    assert len(set(names)) == len(names) == 2 + 2 * 2 * (2 + 3), "collect per task; 2 trainings, 3 evaluated per seed"
     for k, job in enumerate(jobs):
         assert {need.name for need in job.needs} <= set(names[:k])
     student = next(job for job in jobs if job.name == "adroit/door/seed1/manicm-simple_dp3/train")

@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from manicm_ms.benchmark.jobs import JudgeJob
+from manicm_ms.benchmark.jobs import EvaluateJob
 from manicm_ms.benchmark.plan import Plan
 from manicm_ms.benchmark.report import (
     all_tables,
@@ -34,13 +34,13 @@ DOCS = Path(__file__).parents[2] / "docs" / "results"
 
 
 def write_results(plan, env_id, seed, method, wins, evaluations=(), **at_end):
-    """What a judge job leaves: the first `wins` of its fresh seeds were solved, the first `at_end` at the last step."""
+    """What an evaluate job leaves: the first `wins` of its seeds were solved, the first `at_end` at the last step."""
 
     def outcomes(k):
         known = {} if not at_end else {"success_at_end": None if at_end["at_end"] is None else k < at_end["at_end"]}
         return {"success": k < wins, **({"success_once": k < wins} if known else {}), **known}
 
-    job = JudgeJob(plan, env_id, seed, next(m for m in plan.parsed_methods if m.name == method))
+    job = EvaluateJob(plan, env_id, seed, next(m for m in plan.parsed_methods if m.name == method))
     job.stem.parent.mkdir(parents=True, exist_ok=True)
     write_json(
         job.result_file,
@@ -199,7 +199,7 @@ def test_the_page_of_results_is_what_the_kept_outcomes_give(name):
 
 def test_where_every_episode_crashed_there_is_no_rate_and_the_job_is_named(plan):
     write_results(plan, "adroit/door", 0, "simple_dp3", 5)
-    job = JudgeJob(plan, "adroit/door", 1, plan.parsed_methods[0])
+    job = EvaluateJob(plan, "adroit/door", 1, plan.parsed_methods[0])
     episodes = [{"seed": s, "success": False, "steps": 0, "crashed": "no device"} for s in plan.fresh_seeds]
     job.stem.parent.mkdir(parents=True)
     write_json(job.result_file, {"nfe": 10, "episodes": episodes, "evaluations": []})

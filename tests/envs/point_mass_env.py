@@ -1,4 +1,4 @@
-"""A small real simulator for tests, and variants of it that each break one promise; workers import this module."""
+"""A small real simulator for tests, and variants of it that each fail one check; workers import this module."""
 
 import torch
 
@@ -128,7 +128,7 @@ BROKEN = {
     "toy/not-finite": (NotFinite, "observations finite"),
     "toy/remembers": (RemembersTheLastEpisode, "same seed same episode"),
 }
-"""id -> (simulator, the promise it breaks)."""
+"""id -> (simulator, the check it fails)."""
 SOUND, RAISING = "toy/point-mass-env", "toy/raising"
 
 for env_id, simulator in {

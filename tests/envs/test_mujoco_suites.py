@@ -1,4 +1,4 @@
-"""Adroit and Meta-World through `make_vec`: the promises on some tasks of each, and what cannot be asked of them."""
+"""Adroit and Meta-World through `make_vec`: the contract on some tasks of each, and what cannot be asked of them."""
 
 import subprocess
 import sys
@@ -21,7 +21,7 @@ SOME = ("metaworld/reach", "metaworld/stick-pull", "adroit/hammer", "adroit/pen"
 
 
 @pytest.mark.parametrize("env_id", SOME)
-def test_keeps_the_promises(env_id):
+def test_keeps_the_contract(env_id):
     assert [f"{r.name}: {r.detail}" for r in check_vec_env(env_id) if not r.passed] == []
 
 

@@ -1,4 +1,4 @@
-"""The vector environments: their promises on every registered id, that a broken one is caught, and errors."""
+"""The vector environments: their contract on every registered id, that a broken one is caught, and errors."""
 
 import os
 import signal
@@ -27,7 +27,7 @@ NO_GPU = not torch.cuda.is_available()
 
 
 @pytest.mark.parametrize("env_id", [*OURS, SOUND])
-def test_every_registered_environment_keeps_the_promises(env_id):
+def test_every_registered_environment_keeps_the_contract(env_id):
     told = []
     results = check_vec_env(env_id, "cpu", on_result=told.append)
     assert [f"{r.name}: {r.detail}" for r in results if not r.passed] == []
@@ -37,10 +37,10 @@ def test_every_registered_environment_keeps_the_promises(env_id):
 
 @pytest.mark.parametrize("env_id", BROKEN)
 def test_a_broken_environment_is_caught(env_id):
-    _, promise = BROKEN[env_id]
+    _, check = BROKEN[env_id]
     failed = {r.name: r.detail for r in check_vec_env(env_id, "cpu") if not r.passed}
-    assert promise in failed
-    assert failed[promise], "the detail says what was seen"
+    assert check in failed
+    assert failed[check], "the detail says what was seen"
 
 
 def checked_as_on_a_gpu(env_id, monkeypatch):
@@ -49,7 +49,7 @@ def checked_as_on_a_gpu(env_id, monkeypatch):
     return {r.name: r for r in check_vec_env(env_id, "cpu")}
 
 
-def test_on_a_gpu_a_seed_promises_the_start_alone(monkeypatch):
+def test_on_a_gpu_a_seed_fixes_the_start_alone(monkeypatch):
     results = checked_as_on_a_gpu("toy/remembers", monkeypatch)
     assert [r.name for r in results.values() if not r.passed] == []
     assert "gpu" in results["unreset row goes on"].detail
@@ -61,7 +61,7 @@ def test_on_a_gpu_the_start_is_compared(monkeypatch):
     assert "at frame 0" in results["same seed same episode"].detail
 
 
-def test_promises_have_names_of_their_own():
+def test_checks_have_names_of_their_own():
     names = [check.__name__ for check in PROPERTIES]
     assert len(set(names)) == len(names) >= 15
 

@@ -57,7 +57,7 @@ def report(tmp_path_factory):
     return out, results, printed
 
 
-def test_results_json_is_strict_and_has_the_promised_keys(report):
+def test_results_json_is_strict_and_has_the_documented_keys(report):
     out, results, _ = report
     stored = json.loads((out / "results.json").read_text(), parse_constant=lambda c: pytest.fail(f"{c} in JSON"))
     assert stored == json.loads(json.dumps(results))
@@ -271,7 +271,7 @@ def test_what_a_checkpoint_was_made_for_and_has_seen_is_told_everywhere(tmp_path
         text = (out / name).read_text()
         assert seen in text
         assert other in text
-        assert "fresh seeds" not in text.split("Results")[0].split("|")[0].replace(seen, "")
+        assert "held-out seeds" not in text.split("Results")[0].split("|")[0].replace(seen, "")
     assert other in " ".join(console.file.getvalue().split())
 
 

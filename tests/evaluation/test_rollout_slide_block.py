@@ -1,4 +1,4 @@
-"""A roll-out survives the death of a worker process of the real simulator."""
+"""A rollout survives the death of a worker process of the real simulator."""
 
 import os
 import signal

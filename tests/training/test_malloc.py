@@ -1,4 +1,4 @@
-"""The allocator setting judged by what it is for: fewer page faults."""
+"""The allocator setting measured by what it is for: fewer page faults."""
 
 import json
 import platform

@@ -1,4 +1,4 @@
-"""Presets: what the recipes are said to be, and combinations that are refused."""
+"""Presets: what the presets are said to be, and combinations that are refused."""
 
 from dataclasses import fields, replace
 
