@@ -57,7 +57,7 @@ def benchmark_command(
     """
     from manicm_ms.benchmark.plan import Plan, parse_envs, parse_seeds, split_names
     from manicm_ms.benchmark.run import benchmark
-    from manicm_ms.envs.vec_env import default_num_envs
+    from manicm_ms.envs.backends import default_num_envs
     from manicm_ms.machine.devices import resolve_device
 
     plan = Plan(

@@ -47,7 +47,7 @@ def collect_command(
         obs_preset: manicm_ms, or dp3 for clouds as the public DP3 wrapper makes them.
     """
     from manicm_ms.cli.collecting import collect_one, collect_tagged
-    from manicm_ms.envs.vec_env import default_num_envs
+    from manicm_ms.envs.backends import default_num_envs
 
     options = {
         "num_envs": num_envs or default_num_envs(), "seed": seed, "style": style, "backend": backend,

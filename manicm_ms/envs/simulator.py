@@ -16,7 +16,7 @@ from torch import Tensor
 
 from manicm_ms.errors import ConfigError, require_at_least
 from manicm_ms.registry import Registry
-from manicm_ms.sensing.camera_model import CameraModel
+from manicm_ms.sensing.camera import CameraModel
 from manicm_ms.sensing.realism import Realism, RealismSample, objects_of
 from manicm_ms.spec import AGENT_POS, DP3_FRAME, OBS_KEYS, POINT_CLOUD, EnvSpec
 

@@ -22,7 +22,7 @@ from manicm_ms.evaluation.video import film_pair
 from manicm_ms.machine.devices import resolve_device
 from manicm_ms.paths import write_json
 from manicm_ms.progress import working
-from manicm_ms.sensing.camera_model import read_camera
+from manicm_ms.sensing.camera_files import read_camera
 from manicm_ms.sensing.realism import REALISM, parse_presets
 
 
@@ -81,8 +81,8 @@ def evaluate(
 
     Raises ManicmError: an unknown name, a checkpoint that does not fit, another evaluation in `out`, a full disk.
     """
+    from manicm_ms.envs.backends import resolve_backend
     from manicm_ms.envs.simulator import ENVS, SimulatorConfig
-    from manicm_ms.envs.vec_env import resolve_backend
 
     entry, seeds, presets = ENVS.get(env_id), tuple(range(seed, seed + episodes)), parse_presets(realism)
     rows = _rows(num_envs, episodes)
@@ -117,7 +117,7 @@ def evaluate(
 
 def _rows(num_envs: int | None, episodes: int) -> int:
     """Return how many rows play at once; raise ConfigError where there is no episode to play."""
-    from manicm_ms.envs.vec_env import default_num_envs
+    from manicm_ms.envs.backends import default_num_envs
 
     if episodes < 1:
         raise ConfigError(f"--episodes must be at least 1, got {episodes}")

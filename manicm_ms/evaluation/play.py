@@ -14,12 +14,12 @@ from manicm_ms.evaluation.records import EpisodeLog
 from manicm_ms.evaluation.rollout import EpisodeResult, RestartableEnv, rollout
 from manicm_ms.machine.devices import torch_threads
 from manicm_ms.progress import progress_bars
-from manicm_ms.sensing.camera_model import CameraModel
+from manicm_ms.sensing.camera import CameraModel
 from manicm_ms.sensing.realism import REALISM, RealismSample
 from manicm_ms.spec import AGENT_POS, ChunkSpec, EnvSpec, require_compatible
 
 if TYPE_CHECKING:
-    from manicm_ms.envs.vec_env import VecEnv
+    from manicm_ms.envs.vector import VecEnv
     from manicm_ms.policies.base import Policy
 
 

@@ -23,7 +23,7 @@ from manicm_ms.envs.simulator import ENVS
 from manicm_ms.errors import ConfigError, SpecMismatchError
 from manicm_ms.paths import require_free_space
 from manicm_ms.provenance import package_versions
-from manicm_ms.sensing.camera_model import CLOUD_SIZE
+from manicm_ms.sensing.depth_cloud import CLOUD_SIZE
 from manicm_ms.sensing.point_cloud import sample_cloud
 from manicm_ms.spec import ActionSpec, EnvSpec, ObsSpec, require_compatible
 
