@@ -17,8 +17,9 @@ import numpy as np
 from manicm_ms.demos.convert.base import IMPORTERS, Tally
 from manicm_ms.demos.convert.raw_store import OPTIONAL, RawStore
 from manicm_ms.demos.convert.scales import Scales, decide
+from manicm_ms.demos.layout import Episode
 from manicm_ms.demos.remarks import store_remarks
-from manicm_ms.demos.store import DemoStore, Episode
+from manicm_ms.demos.store import DemoStore
 from manicm_ms.envs.simulator import ENVS
 from manicm_ms.errors import ConfigError, SpecMismatchError
 from manicm_ms.paths import require_free_space
