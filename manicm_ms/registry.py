@@ -16,6 +16,10 @@ from manicm_ms.errors import ConfigError, DuplicateNameError, TaskWarning, Unkno
 
 T = TypeVar("T")
 
+TASKS = "manicm_ms.tasks"
+"""The package of tasks, which users add theirs to. It is named here alone and imported at the first look-up: tasks
+import the registries in which they enter themselves, and what holds a registry imports no task."""
+
 _entered: list[tuple[Registry[Any], str]] = []
 """Registry and name of every entry, in order: what a module had entered before it failed is taken out again."""
 _left_out: set[str] = set()

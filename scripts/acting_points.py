@@ -10,7 +10,9 @@ from pathlib import Path
 
 import tyro
 
-from manicm_ms.envs.vec_env import VecEnv, default_num_envs, make_vec
+from manicm_ms.envs.backends import default_num_envs
+from manicm_ms.envs.vec_env import make_vec
+from manicm_ms.envs.vector import VecEnv
 from manicm_ms.evaluation.rollout import RestartableEnv, rollout
 from manicm_ms.evaluation.statistics import compare_paired, success_rate
 from manicm_ms.machine.devices import torch_threads

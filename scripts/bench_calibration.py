@@ -24,7 +24,8 @@ from manicm_ms.errors import CalibrationError
 from manicm_ms.sensing.calibration import CharucoSpec, solve_views
 from manicm_ms.sensing.calibration.board import detect
 from manicm_ms.sensing.calibration.hand_eye import Pinhole, View
-from manicm_ms.sensing.camera_model import Crop, default_camera
+from manicm_ms.sensing.camera import Crop
+from manicm_ms.sensing.camera_files import default_camera
 
 VIEWS, SEEDS = 14, 3
 STREAMS = {

@@ -18,7 +18,9 @@ import tyro
 from torch import Tensor
 
 from manicm_ms.paths import write_text
-from manicm_ms.sensing.camera_model import CameraModel, default_camera, depth_to_cloud
+from manicm_ms.sensing.camera import CameraModel
+from manicm_ms.sensing.camera_files import default_camera
+from manicm_ms.sensing.depth_cloud import depth_to_cloud
 from manicm_ms.sensing.point_cloud import Box
 from manicm_ms.sensing.stereo_depth import StereoDepth
 

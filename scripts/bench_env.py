@@ -28,10 +28,12 @@ vulkan.prepare()  # before SAPIEN is first imported
 import gymnasium  # noqa: E402
 import mani_skill.envs  # noqa: E402, F401  (registers PickCube-v1)
 
+from manicm_ms.envs.backends import resolve_backend  # noqa: E402
 from manicm_ms.envs.chunk import ActionChunk  # noqa: E402
 from manicm_ms.envs.maniskill import ManiSkillSimulator  # noqa: E402
 from manicm_ms.envs.simulator import ENVS, SimulatorConfig  # noqa: E402
-from manicm_ms.envs.vec_env import VecEnv, make_vec, resolve_backend  # noqa: E402
+from manicm_ms.envs.vec_env import make_vec  # noqa: E402
+from manicm_ms.envs.vector import VecEnv  # noqa: E402
 from manicm_ms.envs.worker import RowEnv  # noqa: E402
 from manicm_ms.errors import ManicmError  # noqa: E402
 

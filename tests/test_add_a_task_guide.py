@@ -79,11 +79,11 @@ def test_a_task_outside_the_repository_goes_from_check_to_evaluation(task_folder
 
 
 def test_the_guide_names_only_commands_that_exist():
-    from manicm_ms.cli import _PLAIN, _WITH_PRESET
+    from manicm_ms.cli import PLAIN, WITH_PRESET
 
     named = re.findall(r"^manicm-ms (\S+)", "\n".join(blocks("console")), re.MULTILINE)
     assert {"check", "collect", "train", "evaluate"} <= set(named)
-    assert set(named) <= {*_PLAIN, *_WITH_PRESET}
+    assert set(named) <= {*PLAIN, *WITH_PRESET}
 
 
 def test_no_folder_is_named_where_the_variable_is_unset(monkeypatch):

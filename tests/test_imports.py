@@ -5,6 +5,7 @@ import json
 import os
 import subprocess
 import sys
+from graphlib import TopologicalSorter
 from pathlib import Path
 
 import pytest
@@ -24,9 +25,9 @@ ALLOWED = {
     "machine": set(),
     "sensing": set(),
     "robots": {"machine"},
-    "envs": {"gym_ids", "robots", "tasks", "machine", "sensing"},
+    "envs": {"gym_ids", "robots", "machine", "sensing"},
     "tasks": {"envs", "robots", "demos", "machine", "sensing"},
-    "demos": {"envs", "tasks", "sensing"},
+    "demos": {"envs", "sensing"},
     "policies": set(),
     "training": {"demos", "policies", "machine"},
     "evaluation": {"envs", "policies", "machine", "sensing"},
@@ -34,6 +35,15 @@ ALLOWED = {
 }
 MAY_SIMULATE = {"robots", "envs", "tasks", "machine"}
 UNBOUND = {"cli"}  # the command line: may import everything, nobody imports it
+
+# module -> the layers that it names in text, for an import when somebody asks for it, beside those that it may import
+NAMED = {
+    "manicm_ms": {"cli"},  # the program whose signals are answered from the start
+    "manicm_ms.gym_ids": {"envs", "tasks"},  # Gymnasium's entry points
+    "manicm_ms.machine.mujoco_gl": {"envs"},  # a module that is run in a process of its own
+    "manicm_ms.paths": {"assets"},  # a folder of files
+    "manicm_ms.registry": {"tasks"},  # found at the first look-up, as users' tasks are
+}
 
 
 def modules() -> dict[str, Path]:
@@ -71,6 +81,13 @@ def imports(name: str) -> set[str]:
     return found
 
 
+def named(name: str) -> set[str]:
+    """Every module of ours that a module names in a text of its own, alone or as an entry point `module:attribute`."""
+    texts = (node.value for node in ast.walk(ast.parse(MODULES[name].read_text(encoding="utf-8")))
+             if isinstance(node, ast.Constant) and isinstance(node.value, str))  # fmt: skip
+    return {text.partition(":")[0] for text in texts} & (MODULES.keys() - {"manicm_ms"})
+
+
 def test_every_part_of_the_package_has_a_rule():
     assert {layer(name) for name in MODULES} <= set(ALLOWED) | UNBOUND
 
@@ -82,6 +99,21 @@ def test_a_module_imports_only_what_its_layer_may(name):
         return
     theirs = {layer(other) for other in imports(name) if other.split(".")[0] == "manicm_ms" and other != "manicm_ms"}
     assert theirs <= ALLOWED[ours] | {ours} | BASE
+
+
+def test_no_layer_leads_back_to_itself():
+    """A circle of layers is one layer in disguise: none of them can be understood, tested or moved alone."""
+    TopologicalSorter(ALLOWED).prepare()  # raises CycleError, which names the circle
+
+
+@pytest.mark.parametrize("name", sorted(MODULES))
+def test_a_module_names_only_what_its_layer_may_import(name):
+    """A name in text is an import that comes later: by importlib, by Gymnasium, by a registry."""
+    ours = layer(name)
+    if ours in UNBOUND:
+        return
+    theirs = {layer(other) for other in named(name)} - ALLOWED[ours] - {ours} - BASE
+    assert theirs == NAMED.get(name, set())
 
 
 @pytest.mark.parametrize("name", sorted(MODULES))

@@ -28,7 +28,8 @@ from rich.console import Console
 from manicm_ms.benchmark.methods import Method, Training
 from manicm_ms.benchmark.plan import Plan
 from manicm_ms.demos.collect import collect
-from manicm_ms.demos.store import DemoStore, store_path
+from manicm_ms.demos.layout import store_path
+from manicm_ms.demos.store import DemoStore
 from manicm_ms.errors import ConfigError
 from manicm_ms.evaluation.machine import machine
 from manicm_ms.evaluation.play import env_maker

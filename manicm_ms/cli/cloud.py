@@ -16,7 +16,10 @@ from torch import Tensor
 
 from manicm_ms.errors import CameraError, ConfigError
 from manicm_ms.paths import require_free, write_bytes
-from manicm_ms.sensing.camera_model import CLOUD_SIZE, CameraModel, depth_to_cloud, read_camera, read_depth
+from manicm_ms.sensing.camera import CameraModel
+from manicm_ms.sensing.camera_files import read_camera
+from manicm_ms.sensing.depth_cloud import CLOUD_SIZE, depth_to_cloud
+from manicm_ms.sensing.depth_images import read_depth
 from manicm_ms.sensing.point_cloud import Box, inside
 from manicm_ms.sensing.realism import resolve_realism
 

@@ -11,7 +11,8 @@ from manicm_ms.cli.listing import Listing, console, show
 from manicm_ms.demos.collect import Collected, collect
 from manicm_ms.demos.expert_files import EXPERT_FILES, fetch
 from manicm_ms.demos.experts import EXPERTS
-from manicm_ms.demos.store import DemoStore, store_path
+from manicm_ms.demos.layout import store_path
+from manicm_ms.demos.store import DemoStore
 from manicm_ms.envs.simulator import ENVS
 from manicm_ms.errors import ConfigError, ManicmError, UnknownNameError
 from manicm_ms.paths import is_disk_full

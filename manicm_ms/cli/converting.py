@@ -36,7 +36,7 @@ def convert_or_import(
     if to is not None:
         done = convert(store, to, out, **writing)
     else:
-        from manicm_ms.cli import this_command
+        from manicm_ms.cli.options import this_command
 
         options = {name: value for name, value in reading.items() if value is not None}
         done = import_store(store, str(source), out, command=this_command(), **options)

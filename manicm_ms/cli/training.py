@@ -9,8 +9,8 @@ from typing import Annotated
 
 import tyro
 
-from manicm_ms.cli import this_command
 from manicm_ms.cli.counts import Seed
+from manicm_ms.cli.options import this_command
 from manicm_ms.errors import ConfigError, ManicmWarning
 from manicm_ms.training.presets import STUDENT_PRESETS, TEACHER_PRESETS, StudentPreset, TeacherPreset
 

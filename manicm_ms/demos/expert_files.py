@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 
 from manicm_ms.errors import ExpertFileError
 from manicm_ms.paths import write_bytes, write_text
-from manicm_ms.registry import Registry
+from manicm_ms.registry import TASKS, Registry
 
 FOLDER_VARIABLE = "MANICM_MS_EXPERTS"
 _TIMEOUT_S = 30
@@ -62,7 +62,7 @@ class ExpertFile:
         return experts_folder() / f"{self.name}.npz"
 
 
-EXPERT_FILES: Registry[ExpertFile] = Registry("expert file", package="manicm_ms.tasks")
+EXPERT_FILES: Registry[ExpertFile] = Registry("expert file", package=TASKS)
 
 
 def experts_folder() -> Path:

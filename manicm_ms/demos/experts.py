@@ -11,7 +11,7 @@ import torch
 from numpy.typing import NDArray
 
 from manicm_ms.errors import UnknownNameError
-from manicm_ms.registry import Registry
+from manicm_ms.registry import TASKS, Registry
 from manicm_ms.spec import EnvSpec
 
 
@@ -50,7 +50,7 @@ class Expert(Protocol):
 ExpertFactory = Callable[[EnvSpec, int, torch.device, str | None], Expert]
 """Builds an expert from `(spec, num_envs, device, style)`; a style of None means the default one."""
 
-EXPERTS: Registry[ExpertFactory] = Registry("expert for env id", package="manicm_ms.tasks")
+EXPERTS: Registry[ExpertFactory] = Registry("expert for env id", package=TASKS)
 
 
 def require_style(style: str | None, styles: Sequence[str]) -> str:

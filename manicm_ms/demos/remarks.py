@@ -11,7 +11,8 @@ from collections.abc import Collection, Iterable, Iterator, Mapping
 
 import numpy as np
 
-from manicm_ms.demos.store import OPTIONAL_FIELDS, STORE_ARRAYS, DemoStore
+from manicm_ms.demos.layout import OPTIONAL_FIELDS, STORE_ARRAYS
+from manicm_ms.demos.store import DemoStore
 from manicm_ms.demos.windows import Windows, window_index
 from manicm_ms.demos.zarr_files import array_names, remark_missing
 from manicm_ms.spec import ChunkSpec, EnvSpec

@@ -13,8 +13,8 @@ from typing import Any
 
 import numpy as np
 
+from manicm_ms.demos.layout import FORMAT, FRAME_ARRAYS, STORE_ARRAYS, frame_shapes
 from manicm_ms.demos.remarks import empty_clouds, field_remarks, length_remarks, unread_remarks
-from manicm_ms.demos.store import FORMAT, FRAME_ARRAYS, STORE_ARRAYS, frame_shapes
 from manicm_ms.demos.zarr_files import (
     ALL_WRITTEN,
     HEADERS,

@@ -10,7 +10,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from manicm_ms.envs.vec_env import Info, Obs, VecEnv, make_vec
+from manicm_ms.envs.vec_env import make_vec
+from manicm_ms.envs.vector import Info, Obs, VecEnv
 from manicm_ms.errors import ActionError, ConfigError, ManicmError
 from manicm_ms.spec import AGENT_POS, DEPTH, IMAGE, POINT_CLOUD, STATE, ChunkSpec
 

@@ -11,7 +11,8 @@ import torch
 from torch import Tensor
 
 from manicm_ms.envs.cameras import MICROMETRE
-from manicm_ms.sensing.camera_model import CLOUD_SIZE, CameraModel, depth_to_cloud
+from manicm_ms.sensing.camera import CameraModel
+from manicm_ms.sensing.depth_cloud import CLOUD_SIZE, depth_to_cloud
 from manicm_ms.sensing.point_cloud import Box
 from manicm_ms.sensing.stereo_depth import StereoDepth
 

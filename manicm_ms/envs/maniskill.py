@@ -27,7 +27,8 @@ from manicm_ms.envs.ur3e_tabletop import UR3eTabletopEnv  # noqa: E402
 from manicm_ms.envs.views import CameraView, IdealView, View  # noqa: E402
 from manicm_ms.errors import ConfigError  # noqa: E402
 from manicm_ms.robots.ur3e_ag95 import TCP_STEP, opening_to_action  # noqa: E402
-from manicm_ms.sensing.camera_model import CameraModel, default_camera, require_view  # noqa: E402
+from manicm_ms.sensing.camera import CameraModel, require_view  # noqa: E402
+from manicm_ms.sensing.camera_files import default_camera  # noqa: E402
 from manicm_ms.sensing.point_cloud import Box  # noqa: E402
 from manicm_ms.sensing.realism import RealismRows  # noqa: E402
 from manicm_ms.spec import AGENT_POS, DEPTH, IMAGE, POINT_CLOUD, STATE, EnvSpec  # noqa: E402

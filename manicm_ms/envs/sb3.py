@@ -12,7 +12,7 @@ from stable_baselines3.common.vec_env import VecEnvWrapper
 from stable_baselines3.common.vec_env.base_vec_env import VecEnvIndices, VecEnvObs, VecEnvStepReturn
 from torch import Tensor
 
-from manicm_ms.envs.vec_env import VecEnv
+from manicm_ms.envs.vector import VecEnv
 from manicm_ms.envs.worker import action_space, observation_space
 from manicm_ms.errors import ConfigError
 from manicm_ms.seeds import require_seed

@@ -15,8 +15,8 @@ import torch
 from torch import Tensor
 
 from manicm_ms.errors import ConfigError, require_at_least
-from manicm_ms.registry import Registry
-from manicm_ms.sensing.camera_model import CameraModel
+from manicm_ms.registry import TASKS, Registry
+from manicm_ms.sensing.camera import CameraModel
 from manicm_ms.sensing.realism import Realism, RealismSample, objects_of
 from manicm_ms.spec import AGENT_POS, DP3_FRAME, OBS_KEYS, POINT_CLOUD, EnvSpec
 
@@ -184,4 +184,4 @@ class EnvEntry:
         return realism.sample(seed, objects_of(self.spec), self.fixed)
 
 
-ENVS: Registry[EnvEntry] = Registry("env id", package="manicm_ms.tasks")
+ENVS: Registry[EnvEntry] = Registry("env id", package=TASKS)

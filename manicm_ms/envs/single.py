@@ -15,7 +15,8 @@ from manicm_ms.envs.requests import SeedStreams
 from manicm_ms.envs.simulator import ENVS, SimulatorConfig
 from manicm_ms.envs.worker import action_space, observation_space
 from manicm_ms.errors import ActionError, BackendError, ConfigError
-from manicm_ms.sensing.camera_model import CameraModel, read_camera
+from manicm_ms.sensing.camera import CameraModel
+from manicm_ms.sensing.camera_files import read_camera
 from manicm_ms.sensing.realism import Realism, resolve_realism
 from manicm_ms.spec import AGENT_POS, POINT_CLOUD
 

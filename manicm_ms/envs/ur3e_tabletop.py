@@ -24,7 +24,7 @@ from manicm_ms.envs.row_builders import RowBuilders
 from manicm_ms.errors import ConfigError
 from manicm_ms.robots.limits import quat_rotate
 from manicm_ms.robots.ur3e_ag95 import FINGER_JOINTS, UR3eAG95
-from manicm_ms.sensing.camera_model import CameraModel
+from manicm_ms.sensing.camera import CameraModel
 from manicm_ms.sensing.point_cloud import Box
 from manicm_ms.sensing.realism import RealismRows, true_cameras
 from manicm_ms.spec import ActionSpec, EnvSpec, ObsSpec

@@ -2,25 +2,22 @@
 
 from __future__ import annotations
 
-import os
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Literal, overload
 
-import torch
-
+from manicm_ms.envs.backends import resolve_backend
 from manicm_ms.envs.cpu_vec_env import CpuVecEnv
 from manicm_ms.envs.gpu_vec_env import GpuVecEnv
 from manicm_ms.envs.numpy_arrays import NumpyVecEnv
-from manicm_ms.envs.simulator import ENVS, EnvEntry, SimulatorConfig
-from manicm_ms.envs.vector import Info, Obs, VecEnv
-from manicm_ms.errors import BackendError, ConfigError
-from manicm_ms.machine import sapien_gpu
-from manicm_ms.sensing.camera_model import CameraModel, read_camera
+from manicm_ms.envs.simulator import ENVS, SimulatorConfig
+from manicm_ms.envs.vector import VecEnv
+from manicm_ms.errors import ConfigError
+from manicm_ms.sensing.camera import CameraModel
+from manicm_ms.sensing.camera_files import read_camera
 from manicm_ms.sensing.realism import Realism, resolve_realism
 from manicm_ms.spec import AGENT_POS, POINT_CLOUD, ChunkSpec
 
-BACKENDS = ("auto", "cpu", "gpu")
 ARRAYS = ("torch", "numpy")
 
 
@@ -127,45 +124,3 @@ def make_vec(
     kind = CpuVecEnv if backend == "cpu" else GpuVecEnv
     env = kind(entry, config.specialise(entry.spec), num_envs, config, chunk)
     return env if arrays == "torch" else NumpyVecEnv(env)
-
-
-def resolve_backend(backend: str, entry: EnvEntry | None = None) -> str:
-    """Return "cpu" or "gpu" for one of `BACKENDS`; raise BackendError where it cannot run here.
-
-    An environment (`entry`) that only has the cpu backend gets it under "auto".
-    """
-    if backend not in BACKENDS:
-        raise BackendError(f"unknown backend {backend!r}: choose from {', '.join(BACKENDS)}")
-    if entry is not None and "gpu" not in entry.backends:
-        if backend == "gpu":
-            raise BackendError(f"{entry.spec.env_id} has no gpu backend, its physics run on the CPU: use backend='cpu'")
-        return "cpu"
-    missing = _gpu_obstacle()
-    if backend == "gpu" and missing:
-        raise BackendError(f"backend 'gpu' cannot run here: {missing}; use backend 'cpu'")
-    if backend == "auto":
-        return "cpu" if missing else "gpu"
-    return backend
-
-
-def _gpu_obstacle() -> str | None:
-    """Return why ManiSkill cannot simulate on a GPU here, or None where it can. Downloads nothing."""
-    if not torch.cuda.is_available():
-        return "torch finds no CUDA device"
-    library = sapien_gpu.physx_gpu_library()
-    if not library.is_file():
-        return f"SAPIEN's PhysX GPU library is not at {library}; {sapien_gpu.PHYSX_REMEDY}"
-    if not sapien_gpu.cuda_can_render():
-        return "SAPIEN cannot render on the CUDA device: the graphics part of its driver is missing"
-    return None
-
-
-def default_num_envs() -> int:
-    """Return how many worker processes suit this machine: its cores."""
-    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
-
-
-__all__ = [
-    "ARRAYS", "BACKENDS", "CpuVecEnv", "GpuVecEnv", "Info", "NumpyVecEnv", "Obs", "VecEnv", "default_num_envs",
-    "make_vec", "resolve_backend",
-]  # fmt: skip

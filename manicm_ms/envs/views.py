@@ -15,7 +15,8 @@ from manicm_ms.envs.depth_clouds import DepthClouds
 from manicm_ms.envs.lighting import Lamp, relight, tint
 from manicm_ms.envs.simulator import SimulatorConfig
 from manicm_ms.envs.ur3e_tabletop import UR3eTabletopEnv
-from manicm_ms.sensing.camera_model import CameraModel, nearest_pixels
+from manicm_ms.sensing.camera import CameraModel
+from manicm_ms.sensing.depth_cloud import nearest_pixels
 from manicm_ms.sensing.point_cloud import crop_transformed, inside, sample_cloud, sample_cloud_batch, transform
 from manicm_ms.sensing.realism import RealismRows, believed_poses, true_cameras
 from manicm_ms.spec import DEPTH, IMAGE, POINT_CLOUD

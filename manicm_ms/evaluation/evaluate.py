@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from rich.console import Console
 
@@ -22,8 +22,13 @@ from manicm_ms.evaluation.video import film_pair
 from manicm_ms.machine.devices import resolve_device
 from manicm_ms.paths import write_json
 from manicm_ms.progress import working
-from manicm_ms.sensing.camera_model import read_camera
+from manicm_ms.sensing.camera_files import read_camera
 from manicm_ms.sensing.realism import REALISM, parse_presets
+
+if TYPE_CHECKING:
+    from manicm_ms.envs.simulator import EnvEntry
+    from manicm_ms.sensing.camera import CameraModel
+    from manicm_ms.spec import EnvSpec
 
 
 def evaluate(
@@ -77,47 +82,54 @@ def evaluate(
         command: the command line to print in the report; None writes the equivalent of this call.
         console: where progress is shown; None is standard output.
 
-    Returns what results.json holds.
-
-    Raises ManicmError: an unknown name, a checkpoint that does not fit, another evaluation in `out`, a full disk.
+    Returns what results.json holds. Raises ManicmError: a name, a checkpoint or a folder that does not fit, no space.
     """
+    from manicm_ms.envs.backends import resolve_backend
     from manicm_ms.envs.simulator import ENVS, SimulatorConfig
-    from manicm_ms.envs.vec_env import resolve_backend
 
     entry, seeds, presets = ENVS.get(env_id), tuple(range(seed, seed + episodes)), parse_presets(realism)
     rows = _rows(num_envs, episodes)
     protocol = Protocol(env_id, seeds, rows, threads, repetitions, videos, presets, to_the_end, entry.seed_limit)
-    model = None if camera is None else read_camera(camera)
     backend = resolve_backend(backend, entry)
-    for preset in presets:
-        entry.require(SimulatorConfig(realism=REALISM.get(preset), camera=model, obs_preset=obs_preset))
-    loaded = load_policies(checkpoints, device := str(resolve_device(device)), control)
+    model = _camera(entry, camera, presets, obs_preset)
+    device = str(resolve_device(device))
     offered = SimulatorConfig(obs_preset=obs_preset, colors=colors).specialise(entry.spec)
-    require_playable(loaded, offered, () if allow_seen_seeds else seeds)
-    evaluated = with_users(loaded, policies, offered)
+    evaluated = _policies(checkpoints, policies, device, control, offered, () if allow_seen_seeds else seeds)
     request = request_of(protocol, evaluated, backend, device, model, obs_preset)
-    asked = (
-        checkpoints,
-        policies,
-        env_id,
-        episodes,
-        seed,
-        out,
-        realism,
-        camera,
-        obs_preset,
-        allow_seen_seeds,
-        to_the_end,
+    command = command or command_of(
+        checkpoints, policies, env_id, episodes, seed, out, realism, camera, obs_preset, allow_seen_seeds, to_the_end
     )
     makers = env_maker(env_id, backend, model, obs_preset)
-    return evaluate_policies(
-        evaluated, protocol, makers, out, request, command or command_of(*asked), console or Console()
-    )
+    return evaluate_policies(evaluated, protocol, makers, out, request, command, console or Console())
+
+
+def _camera(entry: EnvEntry, file: Path | None, presets: Sequence[str], obs_preset: str) -> CameraModel | None:
+    """Return the camera of a file; raise ConfigError where the environment lacks it, a preset or the observations."""
+    from manicm_ms.envs.simulator import SimulatorConfig
+
+    camera = None if file is None else read_camera(file)
+    for preset in presets:
+        entry.require(SimulatorConfig(realism=REALISM.get(preset), camera=camera, obs_preset=obs_preset))
+    return camera
+
+
+def _policies(
+    checkpoints: Sequence[Path],
+    sources: Sequence[str],
+    device: str,
+    control: bool,
+    offered: EnvSpec,
+    held_out: Sequence[int],
+) -> list[EvaluatedPolicy]:
+    """Return the policies of the checkpoints and those of the user's own, all of which can play what is `offered`."""
+    loaded = load_policies(checkpoints, device, control)
+    require_playable(loaded, offered, held_out)
+    return with_users(loaded, sources, offered)
 
 
 def _rows(num_envs: int | None, episodes: int) -> int:
     """Return how many rows play at once; raise ConfigError where there is no episode to play."""
-    from manicm_ms.envs.vec_env import default_num_envs
+    from manicm_ms.envs.backends import default_num_envs
 
     if episodes < 1:
         raise ConfigError(f"--episodes must be at least 1, got {episodes}")

@@ -14,12 +14,13 @@ from manicm_ms.evaluation.records import EpisodeLog
 from manicm_ms.evaluation.rollout import EpisodeResult, RestartableEnv, rollout
 from manicm_ms.machine.devices import torch_threads
 from manicm_ms.progress import progress_bars
-from manicm_ms.sensing.camera_model import CameraModel
+from manicm_ms.sensing.camera import CameraModel
 from manicm_ms.sensing.realism import REALISM, RealismSample
 from manicm_ms.spec import AGENT_POS, ChunkSpec, EnvSpec, require_compatible
 
 if TYPE_CHECKING:
-    from manicm_ms.envs.vec_env import VecEnv
+    from manicm_ms.envs.vector import VecEnv
+    from manicm_ms.evaluation.user_policy import UserPolicy
     from manicm_ms.policies.base import Policy
 
 
@@ -32,7 +33,7 @@ class EnvMaker(NamedTuple):
         conditions: (realism preset, seed) -> what is drawn for that episode beside its scene.
     """
 
-    for_policy: Callable[[Policy, int, str], VecEnv]
+    for_policy: Callable[[Policy | UserPolicy, int, str], VecEnv]
     for_film: Callable[[int, str], VecEnv]
     conditions: Conditions = lambda preset, seed: {}
 
@@ -42,7 +43,7 @@ def env_maker(env_id: str, backend: str, camera: CameraModel | None = None, obs_
     from manicm_ms.envs.simulator import ENVS
     from manicm_ms.envs.vec_env import make_vec
 
-    def for_policy(policy: Policy, n: int, preset: str) -> VecEnv:
+    def for_policy(policy: Policy | UserPolicy, n: int, preset: str) -> VecEnv:
         obs = policy.spec.obs
         return make_vec(
             env_id, n, backend, chunk=policy.chunk, num_points=obs.num_points, colors=obs.point_channels == 6,

@@ -17,7 +17,7 @@ from manicm_ms.evaluation.protocol import (
     EvaluatedPolicy,
     Protocol,
 )
-from manicm_ms.sensing.camera_model import CameraModel
+from manicm_ms.sensing.camera import CameraModel
 from manicm_ms.sensing.realism import REALISM
 
 

@@ -17,7 +17,7 @@ from manicm_ms.evaluation.decisions import Decider, Decisions
 from manicm_ms.spec import ChunkSpec, require_compatible
 
 if TYPE_CHECKING:
-    from manicm_ms.envs.vec_env import VecEnv
+    from manicm_ms.envs.vector import VecEnv
 
 MAX_RESTARTS = 3
 """Restarts of a dead env in a row, without an episode that ended by itself, before the rollout gives up."""

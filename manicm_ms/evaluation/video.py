@@ -19,7 +19,7 @@ from manicm_ms.evaluation.rollout import EpisodeResult
 from manicm_ms.progress import progress_bars
 
 if TYPE_CHECKING:
-    from manicm_ms.envs.vec_env import VecEnv
+    from manicm_ms.envs.vector import VecEnv
 
 _HOLD_SECONDS = 0.6
 """How long the last frame stands still, so that the outcome can be seen."""

@@ -7,7 +7,7 @@ from collections.abc import Callable
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
-    from manicm_ms.sensing.camera_model import CameraModel
+    from manicm_ms.sensing.camera import CameraModel
 
 _OFF_CENTRE = (
     0.1  # of a side; the axis of a rectified stream lies within 0.03, that of 640 pixels is off by 0.13 in 848

@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 
 from manicm_ms.errors import ConfigError
 from manicm_ms.registry import Registry
-from manicm_ms.sensing.camera_model import CameraModel
+from manicm_ms.sensing.camera import CameraModel
 from manicm_ms.sensing.stereo_depth import StereoDepth
 from manicm_ms.spec import EnvSpec
 

@@ -14,7 +14,8 @@ import torch
 from torch import Tensor
 
 from manicm_ms.errors import ConfigError
-from manicm_ms.sensing.camera_model import MAX_RAW, CameraModel
+from manicm_ms.sensing.camera import CameraModel
+from manicm_ms.sensing.depth_images import MAX_RAW
 
 _STREAM = 0xD435  # keeps the camera's draws apart from the scene's, which come from the same seed
 _SHADOW_TOLERANCE = 0.01  # pixels: rounding must not let a plane hide itself

@@ -21,7 +21,8 @@ from typing import Any, TypeVar
 from kit import FILE_BACK_BYTES, Budget, Results, last_error, part_arguments, results_of
 from rich.console import Console
 
-from manicm_ms.demos.store import DemoStore, store_path
+from manicm_ms.demos.layout import store_path
+from manicm_ms.demos.store import DemoStore
 from manicm_ms.demos.windows import Windows
 from manicm_ms.policies.checkpoint import load_checkpoint, read_manifest, save_checkpoint
 from manicm_ms.training.interrupt import stop_requests

@@ -13,8 +13,9 @@ import pytest
 from reach_demos import make_store
 
 from manicm_ms import __version__
-from manicm_ms.cli import INTERRUPTED, USER_ERROR, _command, _explain, main
+from manicm_ms.cli import INTERRUPTED, USER_ERROR, command_of, main
 from manicm_ms.cli.counts import least_values
+from manicm_ms.cli.messages import explain
 from manicm_ms.policies.checkpoint import read_manifest, verify_checkpoint
 from manicm_ms.training.log import read_log
 from manicm_ms.training.run_folder import training_folder
@@ -205,7 +206,7 @@ def test_a_folder_without_write_permission_is_one_line(told, demos, tmp_path):
 
 def test_an_error_about_no_file_is_not_hidden():
     with pytest.raises(ConnectionError, match="a defect"):
-        _explain(ConnectionError("a defect"))
+        explain(ConnectionError("a defect"))
 
 
 @pytest.mark.parametrize(
@@ -291,16 +292,16 @@ REQUIRED = {
 WHOLE_NUMBERS = [
     (command, option, least)
     for command in COMMANDS
-    for option, least in least_values(_command(command, [])).items()
+    for option, least in least_values(command_of(command, [])).items()
 ]  # fmt: skip
 
 
 @pytest.mark.parametrize("command", COMMANDS)
 def test_every_whole_number_says_the_least_that_it_takes(command):
-    hints = get_type_hints(_command(command, []))
+    hints = get_type_hints(command_of(command, []))
     whole = {name for name, hint in hints.items() if int in (hint, *getattr(hint, "__args__", ()))}
     pairs = {"squares"}  # of a board, which says itself what it may have
-    assert whole - pairs - {"return"} == set(least_values(_command(command, [])))
+    assert whole - pairs - {"return"} == set(least_values(command_of(command, [])))
 
 
 @pytest.mark.parametrize(("command", "option", "least"), WHOLE_NUMBERS)

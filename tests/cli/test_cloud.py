@@ -16,7 +16,9 @@ from manicm_ms.envs.simulator import ENVS, SimulatorConfig
 from manicm_ms.envs.vec_env import make_vec
 from manicm_ms.errors import CameraError
 from manicm_ms.paths import asset
-from manicm_ms.sensing.camera_model import default_camera, depth_to_cloud, read_camera, write_camera, write_depth
+from manicm_ms.sensing.camera_files import default_camera, read_camera, write_camera
+from manicm_ms.sensing.depth_cloud import depth_to_cloud
+from manicm_ms.sensing.depth_images import write_depth
 from manicm_ms.sensing.point_cloud import Box
 from manicm_ms.sensing.realism import REALISM, RealismRows, believed_poses, true_cameras
 from manicm_ms.spec import DEPTH, POINT_CLOUD

@@ -6,7 +6,8 @@ import toy_point_mass
 
 from manicm_ms.cli import collecting
 from manicm_ms.demos.experts import EXPERTS
-from manicm_ms.demos.store import DemoStore, store_path
+from manicm_ms.demos.layout import store_path
+from manicm_ms.demos.store import DemoStore
 from manicm_ms.envs.simulator import ENVS
 from manicm_ms.errors import ManicmError, UnknownNameError
 

@@ -2,7 +2,8 @@
 
 import numpy as np
 
-from manicm_ms.demos.store import DemoStore, Episode
+from manicm_ms.demos.layout import Episode
+from manicm_ms.demos.store import DemoStore
 from manicm_ms.spec import ActionSpec, EnvSpec, ObsSpec
 
 SPEC = EnvSpec(

@@ -12,7 +12,8 @@ import pytest
 import torch
 from toy_point_mass import ENV_ID, FIRST_BROKEN_SEED, MAX_STEPS, unsolvable
 
-from manicm_ms.demos.collect import Collector, collect, fill
+from manicm_ms.demos.attempts import Collector
+from manicm_ms.demos.collect import collect, fill
 from manicm_ms.demos.experts import EXPERTS
 from manicm_ms.demos.store import DemoStore
 from manicm_ms.envs.vec_env import make_vec

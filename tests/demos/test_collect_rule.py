@@ -6,10 +6,11 @@ import pytest
 from toy_blinker import ENV_ID, LAST_ID, MAX_STEPS, RULE, TWICE_ID, Onlooker
 from toy_point_mass import ENV_ID as POINT_MASS
 
-from manicm_ms.demos.collect import Collector, collect, collect_episodes
+from manicm_ms.demos.attempts import Collector
+from manicm_ms.demos.collect import collect, collect_episodes
 from manicm_ms.demos.store import DemoStore
+from manicm_ms.envs.gpu_vec_env import GpuVecEnv
 from manicm_ms.envs.simulator import ENVS, DemoRule, SimulatorConfig
-from manicm_ms.envs.vec_env import GpuVecEnv
 from manicm_ms.errors import ConfigError, StoreError
 from manicm_ms.spec import AGENT_POS, POINT_CLOUD, STATE
 

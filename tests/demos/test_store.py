@@ -15,7 +15,8 @@ import pytest
 import zarr
 from store_samples import PROVENANCE, SPEC, episode, make_store, require_same
 
-from manicm_ms.demos.store import DemoStore, Episode
+from manicm_ms.demos.layout import Episode
+from manicm_ms.demos.store import DemoStore
 from manicm_ms.demos.survey import survey
 from manicm_ms.errors import NoSpaceError, OutputExistsError, StoreError
 from manicm_ms.paths import exclusive_lock
@@ -95,7 +96,7 @@ def test_layout_is_zarr_v2_as_public_code_reads_it(tmp_path):
 
 
 def test_episodes_cross_all_chunk_borders(tmp_path, monkeypatch):
-    monkeypatch.setattr("manicm_ms.demos.store._CHUNK_EPISODES", 4)
+    monkeypatch.setattr("manicm_ms.demos.layout._CHUNK_EPISODES", 4)
     path, seeds = tmp_path / "a.zarr", range(13)  # data chunks hold 30 frames
     make_store(path, seeds)
     ends = np.cumsum([len(episode(s)) for s in seeds])
@@ -186,7 +187,7 @@ def test_an_interrupted_append_leaves_no_trace(tmp_path):
     whole = make_store(tmp_path / "whole.zarr", (*SEEDS, 7))
     broken = make_store(tmp_path / "broken.zarr", SEEDS)
     with DemoStore.open(broken, "a") as store:
-        store._write_frames({f: getattr(episode(100), f) for f in store.fields}, episode(100))
+        store._arrays.write({f: getattr(episode(100), f) for f in store.fields}, episode(100), np.zeros(0))
     with DemoStore.open(broken) as store:
         assert len(store) == len(SEEDS)
         assert len(store.point_cloud) == store.num_frames
@@ -297,7 +298,7 @@ def test_every_chunk_has_a_file_and_one_that_is_lost_is_missed(tmp_path):
             store.append(idle(0, length))
     assert {p.name for p in (path / "data/action").glob("[0-9]*")} == {"0.0", "1.0", "2.0"}
     with DemoStore.open(path, "a") as store:  # a cut leaves the files of what is committed
-        store._write_frames({f: getattr(idle(1, 60), f) for f in store.fields}, idle(1, 60))
+        store._arrays.write({f: getattr(idle(1, 60), f) for f in store.fields}, idle(1, 60), np.zeros(0))
     with DemoStore.open(path, "a") as store:
         assert store.missing_files == ()
         assert not store.action.any()

@@ -65,7 +65,7 @@ def test_a_store_without_it_is_as_before(tmp_path):
 
 def test_an_append_that_was_cut_short_leaves_none_of_it(store):
     with DemoStore.open(store, "a") as writer:
-        table = writer._group["meta/realism"]
+        table = writer._arrays.meta("realism")
         table.resize((5, 2))
         table[3:] = 9.0
     with DemoStore.open(store, "a") as writer:

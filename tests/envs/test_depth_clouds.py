@@ -12,7 +12,7 @@ from manicm_ms.envs.depth_clouds import DepthClouds, sapien_pose
 from manicm_ms.envs.maniskill import workspace_of
 from manicm_ms.envs.simulator import ENVS, SimulatorConfig
 from manicm_ms.errors import ConfigError, UnknownNameError
-from manicm_ms.sensing.camera_model import default_camera
+from manicm_ms.sensing.camera_files import default_camera
 from manicm_ms.sensing.point_cloud import Box
 from manicm_ms.sensing.stereo_depth import StereoDepth
 from manicm_ms.spec import POINT_CLOUD

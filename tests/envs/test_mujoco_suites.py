@@ -11,9 +11,10 @@ import torch
 if find_spec("metaworld") is None:
     pytest.skip("the MuJoCo suites are an extra, which is not installed", allow_module_level=True)
 
+from manicm_ms.envs.backends import resolve_backend
 from manicm_ms.envs.conformance import check_vec_env
 from manicm_ms.envs.simulator import ENVS
-from manicm_ms.envs.vec_env import make_vec, resolve_backend
+from manicm_ms.envs.vec_env import make_vec
 from manicm_ms.errors import BackendError, ConfigError, RenderDeviceError, UnknownNameError
 from manicm_ms.spec import AGENT_POS, POINT_CLOUD, STATE, ChunkSpec
 

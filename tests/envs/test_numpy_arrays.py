@@ -12,8 +12,10 @@ from gymnasium.vector import AutoresetMode, VectorEnv
 from gymnasium.wrappers import ClipAction, FlattenObservation, TransformReward
 from point_mass_env import MAX_STEPS, SOUND, Raises, make_spec
 
+from manicm_ms.envs.gpu_vec_env import GpuVecEnv
+from manicm_ms.envs.numpy_arrays import NumpyVecEnv
 from manicm_ms.envs.simulator import EnvEntry, SimulatorConfig
-from manicm_ms.envs.vec_env import GpuVecEnv, NumpyVecEnv, make_vec
+from manicm_ms.envs.vec_env import make_vec
 from manicm_ms.errors import ConfigError
 from manicm_ms.spec import AGENT_POS, IMAGE, STATE
 

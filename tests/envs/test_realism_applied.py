@@ -9,7 +9,7 @@ import torch
 from manicm_ms.envs.simulator import ENVS, SimulatorConfig
 from manicm_ms.errors import ConfigError
 from manicm_ms.robots.ur3e_ag95 import FINGER_JOINTS, UR3eAG95
-from manicm_ms.sensing.camera_model import default_camera
+from manicm_ms.sensing.camera_files import default_camera
 from manicm_ms.sensing.realism import REALISM, Realism, believed_poses, displaced, true_cameras
 from manicm_ms.spec import AGENT_POS, DEPTH, IMAGE, POINT_CLOUD, STATE
 

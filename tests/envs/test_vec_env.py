@@ -12,9 +12,12 @@ import torch
 from gymnasium.vector import AutoresetMode
 from point_mass_env import BROKEN, RAISING, SOUND
 
+from manicm_ms.envs.backends import resolve_backend
 from manicm_ms.envs.conformance import PROPERTIES, check_vec_env
+from manicm_ms.envs.cpu_vec_env import CpuVecEnv
+from manicm_ms.envs.gpu_vec_env import GpuVecEnv
 from manicm_ms.envs.simulator import ENVS, SimulatorConfig
-from manicm_ms.envs.vec_env import CpuVecEnv, GpuVecEnv, make_vec, resolve_backend
+from manicm_ms.envs.vec_env import make_vec
 from manicm_ms.errors import ActionError, BackendError, ConfigError, ManicmError, RenderDeviceError, UnknownNameError
 from manicm_ms.spec import AGENT_POS, POINT_CLOUD, STATE, ChunkSpec
 

@@ -9,7 +9,7 @@ import pytest
 from point_mass import SPEC, PointMass, Proportional
 from rich.console import Console
 
-from manicm_ms.cli import evaluate_command
+from manicm_ms.cli.evaluating import evaluate_command
 from manicm_ms.errors import ConfigError, OutputExistsError, SpecMismatchError
 from manicm_ms.evaluation.evaluate import evaluate_policies
 from manicm_ms.evaluation.intervals import rate_interval

@@ -7,7 +7,8 @@ import pytest
 import torch
 
 from manicm_ms.errors import ConfigError
-from manicm_ms.sensing.camera_model import Crop, default_camera
+from manicm_ms.sensing.camera import Crop
+from manicm_ms.sensing.camera_files import default_camera
 from manicm_ms.sensing.stereo_depth import StereoDepth, hidden_from_right, incidence_cosine, window_noise
 
 CAMERA = default_camera()

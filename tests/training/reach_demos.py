@@ -5,7 +5,8 @@ The relation between cloud, hand and action is exact, so a test knows what shoul
 
 import numpy as np
 
-from manicm_ms.demos.store import DemoStore, Episode
+from manicm_ms.demos.layout import Episode
+from manicm_ms.demos.store import DemoStore
 from manicm_ms.spec import ActionSpec, EnvSpec, ObsSpec
 
 STEP = 0.05  # metres that an action of 1 moves the hand

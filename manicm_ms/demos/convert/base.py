@@ -12,8 +12,9 @@ from typing import Any, Protocol
 
 import numpy as np
 
+from manicm_ms.demos.layout import Episode
 from manicm_ms.demos.remarks import empty_clouds, store_remarks
-from manicm_ms.demos.store import DemoStore, Episode
+from manicm_ms.demos.store import DemoStore
 from manicm_ms.errors import ManicmError, NoSpaceError, OutputExistsError, StoreError
 from manicm_ms.paths import is_disk_full, require_free_space, sync_tree, temporary_folder
 from manicm_ms.progress import progress_of

@@ -17,13 +17,14 @@ import numpy as np
 from manicm_ms.demos.convert.base import IMPORTERS, Tally
 from manicm_ms.demos.convert.raw_store import OPTIONAL, RawStore
 from manicm_ms.demos.convert.scales import Scales, decide
+from manicm_ms.demos.layout import Episode
 from manicm_ms.demos.remarks import store_remarks
-from manicm_ms.demos.store import DemoStore, Episode
+from manicm_ms.demos.store import DemoStore
 from manicm_ms.envs.simulator import ENVS
 from manicm_ms.errors import ConfigError, SpecMismatchError
 from manicm_ms.paths import require_free_space
 from manicm_ms.provenance import package_versions
-from manicm_ms.sensing.camera_model import CLOUD_SIZE
+from manicm_ms.sensing.depth_cloud import CLOUD_SIZE
 from manicm_ms.sensing.point_cloud import sample_cloud
 from manicm_ms.spec import ActionSpec, EnvSpec, ObsSpec, require_compatible
 

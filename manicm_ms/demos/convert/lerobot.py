@@ -15,7 +15,7 @@ import numpy as np
 
 from manicm_ms.demos.convert.base import EXPORTERS, SIDECAR, Export, MissingDependencyError, Tally
 from manicm_ms.demos.convert.writer import Writer
-from manicm_ms.demos.store import Episode, frame_shapes
+from manicm_ms.demos.layout import Episode, frame_shapes
 from manicm_ms.errors import ConfigError
 from manicm_ms.paths import write_json
 from manicm_ms.spec import EnvSpec

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 import zarr
 
-from manicm_ms.demos.store import FORMAT
+from manicm_ms.demos.layout import FORMAT
 from manicm_ms.demos.zarr_files import (
     EPISODE_ENDS,
     array_names,

@@ -33,7 +33,8 @@ from manicm_ms.sensing.calibration.hand_eye import (
 )
 from manicm_ms.sensing.calibration.intrinsics import solve_intrinsics
 from manicm_ms.sensing.calibration.robot_poses import read_poses
-from manicm_ms.sensing.camera_model import CameraModel, Crop, default_camera, read_camera, write_camera
+from manicm_ms.sensing.camera import CameraModel, Crop
+from manicm_ms.sensing.camera_files import default_camera, read_camera, write_camera
 
 MIN_VIEWS = 6
 """Views that are needed: three determine both poses, the others show whether one of them is wrong."""

@@ -16,7 +16,8 @@ from manicm_ms.errors import CalibrationError, CameraError, ConfigError, OutputE
 from manicm_ms.sensing.calibration import CharucoSpec, calibrate, print_board, solve_views
 from manicm_ms.sensing.calibration.board import detect
 from manicm_ms.sensing.calibration.other_boards import advice
-from manicm_ms.sensing.camera_model import Crop, default_camera, read_camera, write_camera
+from manicm_ms.sensing.camera import Crop
+from manicm_ms.sensing.camera_files import default_camera, read_camera, write_camera
 
 VIEWS = 12
 
