@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import importlib
+import importlib.metadata
 import importlib.util
 import os
 import pkgutil
@@ -33,11 +34,12 @@ class Registry(Generic[T]):
         kind: what an entry is called in an error message, for example "env id".
         package: dotted name of a package whose modules are imported once, before the first look-up,
             so that their decorators run; None where all entries are registered by their importer.
+        group: entry-point group of installed packages whose modules are imported then too; None for no such group.
     """
 
-    def __init__(self, kind: str, package: str | None = None) -> None:
+    def __init__(self, kind: str, package: str | None = None, group: str | None = None) -> None:
         self.kind = kind
-        self._package = package
+        self._package, self._group = package, group
         self._entries: dict[str, T] = {}
         self._tags: dict[str, frozenset[str]] = {}
         self._former: dict[str, str] = {}
@@ -102,10 +104,14 @@ class Registry(Generic[T]):
                 importlib.import_module(name)
             elif name not in _left_out:
                 _import_or_leave_out(name)
+        if self._group is not None:
+            for point in importlib.metadata.entry_points(group=self._group):
+                if point.module not in _left_out:
+                    _import_or_leave_out(point.module)
 
 
 def _import_or_leave_out(name: str) -> None:
-    """Import a module from a folder of the user's; one that cannot be imported is named in one line and left out."""
+    """Import a module that is not ours; one that cannot be imported is named in one line and left out."""
     before = len(_entered)
     try:
         importlib.import_module(name)
@@ -114,9 +120,17 @@ def _import_or_leave_out(name: str) -> None:
             registry._remove(entry)
         del _entered[before:]
         _left_out.add(name)
-        spec = importlib.util.find_spec(name)
-        file, line, what = where_it_failed(error, spec.origin if spec and spec.origin else name)
+        file, line, what = where_it_failed(error, _origin(name))
         warnings.warn(f"{file}, line {line}: {what}; its tasks are left out", TaskWarning, stacklevel=2)
+
+
+def _origin(name: str) -> str:
+    """Return the file of a module, or its name where there is none."""
+    try:
+        spec = importlib.util.find_spec(name)
+    except ImportError:  # the package that holds it
+        return name
+    return spec.origin if spec and spec.origin else name
 
 
 def where_it_failed(error: BaseException, origin: str) -> tuple[str, int, str]:

@@ -91,3 +91,23 @@ def test_a_broken_file_of_the_package_itself_is_a_defect(package):
     (own / "shipped.py").write_text("import no_such_module\n")
     with pytest.raises(ModuleNotFoundError):
         fruits.names()
+
+
+def test_modules_of_installed_packages_are_found_by_their_entry_points(package, tmp_path):
+    _, _, own = package
+    (tmp_path / "their_fruits.py").write_text(GOOD.format(name="theirs"))
+    (tmp_path / "their_broken_fruits.py").write_text("import no_such_module\n")
+    info = tmp_path / "their_fruits-1.0.dist-info"
+    info.mkdir()
+    (info / "METADATA").write_text("Metadata-Version: 2.1\nName: their-fruits\nVersion: 1.0\n")
+    points = ("[fruits.of_a_test]", "good = their_fruits", "bad = their_broken_fruits", "gone = no_such_fruits.module")
+    (info / "entry_points.txt").write_text("\n".join(points))
+    fruits = Registry("fruit", package=own.name, group="fruits.of_a_test")
+    sys.modules["fruit_registry"].FRUITS = fruits
+    with pytest.warns(TaskWarning) as told:
+        assert fruits.names() == ("shipped", "theirs")
+    lines = sorted(str(warning.message) for warning in told)
+    assert lines[0].startswith(f"{tmp_path / 'their_broken_fruits.py'}, line 1: ModuleNotFoundError")
+    assert lines[1].startswith("no_such_fruits.module, line 1: ModuleNotFoundError")
+    for name in ("their_fruits", "their_broken_fruits"):
+        sys.modules.pop(name, None)

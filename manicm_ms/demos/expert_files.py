@@ -62,7 +62,7 @@ class ExpertFile:
         return experts_folder() / f"{self.name}.npz"
 
 
-EXPERT_FILES: Registry[ExpertFile] = Registry("expert file", package=TASKS)
+EXPERT_FILES: Registry[ExpertFile] = Registry("expert file", package=TASKS, group=TASKS)
 
 
 def experts_folder() -> Path:

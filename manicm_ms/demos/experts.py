@@ -50,7 +50,7 @@ class Expert(Protocol):
 ExpertFactory = Callable[[EnvSpec, int, torch.device, str | None], Expert]
 """Builds an expert from `(spec, num_envs, device, style)`; a style of None means the default one."""
 
-EXPERTS: Registry[ExpertFactory] = Registry("expert for env id", package=TASKS)
+EXPERTS: Registry[ExpertFactory] = Registry("expert for env id", package=TASKS, group=TASKS)
 
 
 def require_style(style: str | None, styles: Sequence[str]) -> str:

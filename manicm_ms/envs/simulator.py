@@ -184,4 +184,4 @@ class EnvEntry:
         return realism.sample(seed, objects_of(self.spec), self.fixed)
 
 
-ENVS: Registry[EnvEntry] = Registry("env id", package=TASKS)
+ENVS: Registry[EnvEntry] = Registry("env id", package=TASKS, group=TASKS)
