@@ -23,7 +23,7 @@ def train_command(arguments: Sequence[str]) -> Callable[..., None]:
 
     def train(
         policy: tyro.conf.Positional[str],
-        data: Path,
+        data: tuple[Path, ...],
         out: Path,
         recipe: Annotated[TeacherPreset, tyro.conf.arg(name="")] = default,
         preset: str = DEFAULT_PRESET,
@@ -34,16 +34,18 @@ def train_command(arguments: Sequence[str]) -> Callable[..., None]:
 
         Args:
             policy: dp3 or simple_dp3.
-            data: store of demonstrations.
+            data: store of demonstrations; several of the same task are read as one.
             out: checkpoint folder to write; state and logs go beside it, to OUT.train.
             recipe: the preset's fields, each of which can be overridden.
             preset: recipe to start from; `manicm-ms list presets` shows them.
             device: torch device; auto takes an accelerator where there is one.
             seed: of weights, batches and noise.
         """
+        from manicm_ms.training.demonstrations import store_paths
         from manicm_ms.training.teacher import train_teacher
 
-        _check_points(recipe, default, data)
+        for store in store_paths(data):
+            _check_points(recipe, default, store)
         train_teacher(policy, data, out, recipe, device=device, seed=seed, command=this_command())
 
     return train
@@ -55,7 +57,7 @@ def distill_command(arguments: Sequence[str]) -> Callable[..., None]:
 
     def distill(
         teacher: Path,
-        data: Path,
+        data: tuple[Path, ...],
         out: Path,
         recipe: Annotated[StudentPreset, tyro.conf.arg(name="")] = default,
         preset: str = DEFAULT_PRESET,
@@ -67,7 +69,7 @@ def distill_command(arguments: Sequence[str]) -> Callable[..., None]:
 
         Args:
             teacher: checkpoint folder of the teacher.
-            data: the store that the teacher was trained on.
+            data: the store, or stores, that the teacher was trained on.
             out: checkpoint folder to write; state and logs go beside it, to OUT.train.
             recipe: the preset's fields, each of which can be overridden.
             preset: recipe to start from; `manicm-ms list presets` shows them.

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
@@ -98,6 +99,14 @@ class Windows:
         ends = np.asarray(store.episode_ends)
         frames = int(ends[-1]) if len(ends) else 0
         return cls.from_arrays(store.point_cloud[:frames], store.state[:frames], store.action[:frames], ends, chunk)
+
+    @classmethod
+    def joined(cls, parts: Sequence[Windows]) -> Windows:
+        """Return the windows of several stores as those of one: frames one after another, no window across stores."""
+        starts = np.cumsum([0, *(len(part.action) for part in parts)]).tolist()
+        fields = {name: torch.cat([getattr(part, name) for part in parts]) for name in (POINT_CLOUD, AGENT_POS, ACTION)}
+        index = torch.cat([part.index + start for part, start in zip(parts, starts, strict=False)])
+        return cls(**fields, index=index, chunk=parts[0].chunk)
 
     def __len__(self) -> int:
         """Return N, the number of windows."""

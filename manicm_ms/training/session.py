@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
 import json
 import math
 import shlex
@@ -16,14 +15,10 @@ from typing import Any
 from lightning_fabric import Fabric
 from rich.console import Console
 
-from manicm_ms.demos.remarks import training_remarks
-from manicm_ms.demos.stats import FieldStats, store_stats
-from manicm_ms.demos.store import DemoStore
-from manicm_ms.demos.windows import Windows
 from manicm_ms.errors import CheckpointError, ConfigError, OutputExistsError, require_at_least
 from manicm_ms.machine.devices import resolve_device
 from manicm_ms.policies.checkpoint import read_manifest, save_checkpoint
-from manicm_ms.spec import ChunkSpec, EnvSpec
+from manicm_ms.training.demonstrations import Demos
 from manicm_ms.training.device import make_fabric, resolve_precision
 from manicm_ms.training.loop import Batches, FitResult, Snapshots, fit
 from manicm_ms.training.objectives import PolicyObjective
@@ -32,47 +27,6 @@ from manicm_ms.training.presets import preset_identity
 from manicm_ms.training.run_folder import RunFolder, open_run, snapshot_folder, training_folder
 
 _NOT_IDENTITY = ("log_every", "save_every", "precision")  # the precision that is used stands beside the preset
-
-
-@dataclass(frozen=True)
-class Demos:
-    """A store of demonstrations, read for training.
-
-    Attributes:
-        spec: of the environment that they come from.
-        windows: all of them, on the CPU.
-        stats: ranges of `point_cloud`, `agent_pos` and `action`.
-        provenance: path, content hash, sizes, `demo_seeds` (the seed of each episode, so that an evaluation can
-            tell what was seen), and the store's own provenance, JSON values.
-        remarks: what a user should know of them, one sentence each; see `demos.remarks`.
-    """
-
-    spec: EnvSpec
-    windows: Windows
-    stats: Mapping[str, FieldStats]
-    provenance: dict[str, Any]
-    remarks: tuple[str, ...] = ()
-
-
-def read_demos(path: Path, chunk: ChunkSpec) -> Demos:
-    """Read a store; raise StoreError where there is none or it is damaged or empty."""
-    with DemoStore.open(path) as store:
-        stats = store_stats(store)
-        windows = Windows.from_store(store, chunk)
-        digest = hashlib.sha256()
-        for tensor in (windows.point_cloud, windows.agent_pos, windows.action, windows.index):
-            digest.update(tensor.numpy().tobytes())
-        provenance = {
-            "path": str(path),
-            "env_id": store.spec.env_id,
-            "episodes": len(store),
-            "frames": len(windows.action),
-            "windows": len(windows),
-            "sha256": digest.hexdigest(),
-            "demo_seeds": store.seeds.tolist(),
-            "collection": store.provenance,
-        }
-        return Demos(store.spec, windows, stats, provenance, tuple(training_remarks(store, windows)))
 
 
 _WORK = {"teacher": "train", "student": "distill"}
@@ -136,7 +90,7 @@ class Session:
     def show_remarks(self, demos: Demos) -> None:
         """Say what a user should know of the demonstrations, a line each."""
         for remark in demos.remarks:
-            self._say(f"{demos.provenance['path']}: {remark}")
+            self._say(remark)
 
     def complete(
         self,

@@ -14,16 +14,17 @@ from manicm_ms.policies.manicm import ManiCM
 from manicm_ms.progress import working
 from manicm_ms.seeds import require_seed
 from manicm_ms.spec import EnvSpec, require_compatible
+from manicm_ms.training.demonstrations import Data, read_demos
 from manicm_ms.training.features import encode_windows
 from manicm_ms.training.loop import Batches
 from manicm_ms.training.objectives import DISTILLATIONS, PolicyObjective
 from manicm_ms.training.presets import StudentPreset
-from manicm_ms.training.session import Session, read_demos
+from manicm_ms.training.session import Session
 
 
 def distill(
     teacher: Path,
-    data: Path,
+    data: Data,
     out: Path,
     preset: StudentPreset,
     *,
@@ -42,7 +43,7 @@ def distill(
 
     Args:
         teacher: checkpoint folder of a diffusion policy.
-        data: store of demonstrations, as a rule the one that the teacher was trained on.
+        data: store of demonstrations, or several, as a rule what the teacher was trained on.
         out: checkpoint folder to write; state and logs go to `<out>.train`.
         preset: how to distil.
         device: "auto", "cpu", "cuda", "cuda:1".
@@ -66,9 +67,9 @@ def distill(
     teacher, objective_type = Path(teacher), DISTILLATIONS.get(preset.objective)
     policy = _load_teacher(teacher)
     demos = read_demos(data, policy.chunk)
-    require_compatible(demos.spec, policy.spec, f"the data {data}", f"the teacher {teacher}")
+    require_compatible(demos.spec, policy.spec, f"the data {demos.provenance['path']}", f"the teacher {teacher}")
     if not allow_other_task:
-        _require_same_task(demos.spec, data, policy.spec, teacher)
+        _require_same_task(demos.spec, demos.provenance["path"], policy.spec, teacher)
     student = ManiCM.from_teacher(policy, nfe=preset.nfe, num_solver_steps=_solver_steps(policy, preset.skip))
     manifest = read_manifest(teacher)
     session = Session.start(
@@ -97,7 +98,7 @@ def _load_teacher(folder: Path) -> DiffusionPolicy:
     return policy
 
 
-def _require_same_task(demonstrated: EnvSpec, data: Path, learnt: EnvSpec, teacher: Path) -> None:
+def _require_same_task(demonstrated: EnvSpec, data: str, learnt: EnvSpec, teacher: Path) -> None:
     """Raise SpecMismatchError where the demonstrations are of another task than the one that the teacher learnt."""
     if demonstrated.env_id != learnt.env_id:
         raise SpecMismatchError(

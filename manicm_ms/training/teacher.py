@@ -12,16 +12,17 @@ from manicm_ms.errors import UnknownNameError
 from manicm_ms.policies.base import POLICIES, make_policy
 from manicm_ms.policies.diffusion import DiffusionPolicy
 from manicm_ms.seeds import require_seed
+from manicm_ms.training.demonstrations import Data, Demos, read_demos
 from manicm_ms.training.loop import Batches
 from manicm_ms.training.objectives import DiffusionObjective, PolicyObjective
 from manicm_ms.training.optim import PowerDecay
 from manicm_ms.training.presets import TeacherPreset
-from manicm_ms.training.session import Demos, Session, read_demos
+from manicm_ms.training.session import Session
 
 
 def train_teacher(
     policy_name: str,
-    data: Path,
+    data: Data,
     out: Path,
     preset: TeacherPreset,
     *,
@@ -37,7 +38,7 @@ def train_teacher(
 
     Args:
         policy_name: a policy tagged "teacher" in `POLICIES`: "dp3", "simple_dp3".
-        data: store of demonstrations.
+        data: store of demonstrations, or several of the same task.
         out: checkpoint folder to write; state and logs go to `<out>.train`.
         preset: how to train.
         device: "auto", "cpu", "cuda", "cuda:1".
