@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 import tyro
 
-from manicm_ms.cli import _PLAIN, _WITH_PRESET, PROGRAM, _command
+from manicm_ms.cli import _GROUPS, _PLAIN, _WITH_PRESET, PROGRAM, _command, bench
 from manicm_ms.evaluation.user_policy import load_user_policy
 from manicm_ms.spec import EnvSpec
 
@@ -42,7 +42,10 @@ DOCUMENTED = [
 def parse(words):
     """Parse a command line as the program does, and run nothing; a bad one ends in SystemExit."""
     name, rest = words[0], [PLACEHOLDERS.get(word, word) for word in words[1:]]
-    command = _command(name, rest)
+    if name in _GROUPS:
+        command, rest = bench.COMMANDS[rest[0]], rest[1:]
+    else:
+        command = _command(name, rest)
 
     @functools.wraps(command)
     def accept(*args, **kwargs):
@@ -62,7 +65,7 @@ def test_a_wrong_command_is_not_accepted():
 
 
 def test_the_docs_show_all_commands():
-    assert {words.values[0][0] for words in DOCUMENTED} >= {*_PLAIN, *_WITH_PRESET} - {"experts"}
+    assert {words.values[0][0] for words in DOCUMENTED} >= {*_PLAIN, *_WITH_PRESET, *_GROUPS} - {"experts"}
 
 
 def test_the_python_of_train_and_evaluate_runs(monkeypatch, capsys):

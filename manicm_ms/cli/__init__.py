@@ -437,6 +437,8 @@ _WITH_PRESET = {
     "train": "Train a diffusion teacher on demonstrations; the same command goes on after Ctrl-C or a kill.",
     "distill": "Distil a teacher into a one-step ManiCM student; the same command goes on after Ctrl-C or a kill.",
 }
+# Commands with commands of their own.
+_GROUPS = {"bench": "Time environments, decisions, experts and sensors; 'manicm-ms bench --help' lists what."}
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
@@ -470,9 +472,13 @@ def _run(arguments: list[str]) -> int | None:
         print(__version__)
         return 0
     name, rest = arguments[0], arguments[1:]
-    if name not in (*_PLAIN, *_WITH_PRESET):
-        raise UnknownNameError("command", name, (*_PLAIN, *_WITH_PRESET))
+    if name not in (*_PLAIN, *_WITH_PRESET, *_GROUPS):
+        raise UnknownNameError("command", name, (*_PLAIN, *_WITH_PRESET, *_GROUPS))
     with warnings_in_one_line():
+        if name in _GROUPS:
+            from manicm_ms.cli import bench
+
+            return bench.run(rest)
         return tyro.cli(
             checked(_command(name, rest)), prog=f"{PROGRAM} {name}", args=rest, config=(tyro.conf.OmitArgPrefixes,)
         )
@@ -492,7 +498,7 @@ def _overview() -> None:
     print(f"usage: {PROGRAM} COMMAND ...   ('{PROGRAM} COMMAND --help' tells more)\n")
     plain = {name: (command.__doc__ or "").splitlines()[0] for name, command in _PLAIN.items()}
     width = console().width
-    for name, summary in {**plain, **_WITH_PRESET}.items():
+    for name, summary in {**plain, **_WITH_PRESET, **_GROUPS}.items():
         print(textwrap.fill(f"  {name:<9} {summary}", width, subsequent_indent=" " * 12, break_on_hyphens=False))
 
 
