@@ -15,8 +15,8 @@ from typing import Any
 import tyro
 
 from manicm_ms.evaluation.intervals import DIFFERENCE_METHOD
-from manicm_ms.evaluation.text import interval_text, success_text
 from manicm_ms.evaluation.results import renewed
+from manicm_ms.evaluation.text import interval_text, success_text
 
 HEAD = (
     "| {first} | policy | NFE | success | 95 % interval | at some step, at the last | one decision, CPU |\n"
