@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 import tyro
 
-from manicm_ms.cli import PLAIN, WITH_PRESET, command_of
+from manicm_ms.cli import GROUPS, PLAIN, WITH_PRESET, bench, command_of
 from manicm_ms.cli.messages import PROGRAM
 from manicm_ms.evaluation.user_policy import load_user_policy
 from manicm_ms.spec import EnvSpec
@@ -43,7 +43,10 @@ DOCUMENTED = [
 def parse(words):
     """Parse a command line as the program does, and run nothing; a bad one ends in SystemExit."""
     name, rest = words[0], [PLACEHOLDERS.get(word, word) for word in words[1:]]
-    command = command_of(name, rest)
+    if name in GROUPS:
+        command, rest = bench.COMMANDS[rest[0]], rest[1:]
+    else:
+        command = command_of(name, rest)
 
     @functools.wraps(command)
     def accept(*args, **kwargs):
@@ -63,7 +66,7 @@ def test_a_wrong_command_is_not_accepted():
 
 
 def test_the_docs_show_all_commands():
-    assert {words.values[0][0] for words in DOCUMENTED} >= {*PLAIN, *WITH_PRESET} - {"experts"}
+    assert {words.values[0][0] for words in DOCUMENTED} >= {*PLAIN, *WITH_PRESET, *GROUPS} - {"experts"}
 
 
 def test_the_python_of_train_and_evaluate_runs(monkeypatch, capsys):

@@ -31,9 +31,10 @@ ALLOWED = {
     "policies": set(),
     "training": {"demos", "policies", "machine"},
     "evaluation": {"envs", "policies", "machine", "sensing"},
+    "bench": {"envs", "robots", "demos", "policies", "evaluation", "machine", "sensing"},
     "benchmark": {"envs", "demos", "policies", "training", "evaluation", "machine"},
 }
-MAY_SIMULATE = {"robots", "envs", "tasks", "machine"}
+MAY_SIMULATE = {"robots", "envs", "tasks", "machine", "bench"}
 UNBOUND = {"cli"}  # the command line: may import everything, nobody imports it
 
 # module -> the layers that it names in text, for an import when somebody asks for it, beside those that it may import
@@ -178,7 +179,7 @@ print(json.dumps(told))
 def test_the_vulkan_driver_is_chosen_before_sapien_is_imported(tmp_path):
     (tmp_path / "driver.json").write_text("{}")
     (tmp_path / "vulkan.json").write_text('{"driver": "driver.json", "preload": []}')
-    names = sorted(name for name in MODULES if layer(name) in {"robots", "envs", "tasks", "demos"})
+    names = sorted(name for name in MODULES if layer(name) in {"robots", "envs", "tasks", "demos", "bench"})
     env = {k: v for k, v in os.environ.items() if k not in ("VK_DRIVER_FILES", "VK_ICD_FILENAMES")}
     env["MANICM_MS_VULKAN"] = str(tmp_path)
     command = [sys.executable, "-c", _STOP_AT_SAPIEN, json.dumps(names)]

@@ -175,3 +175,7 @@ def test_the_installed_command_line_runs(installed):
     manicm_ms = installed / "bin" / "manicm-ms"
     assert run_installed(manicm_ms, "--version") == f"{__version__}\n"
     assert "ur3e/slide-block" in run_installed(manicm_ms, "list", "envs")
+    command = [manicm_ms, "bench", "depth", "--write"]
+    done = subprocess.run(command, capture_output=True, text=True, cwd=installed, check=False)
+    assert (done.returncode, done.stdout) == (2, "")
+    assert "manicm_ms is installed outside of one" in done.stderr, "there is no docs/results to keep a page in"

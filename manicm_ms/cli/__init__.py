@@ -41,6 +41,8 @@ WITH_PRESET = {
     "train": "Train a diffusion teacher on demonstrations; the same command goes on after Ctrl-C or a kill.",
     "distill": "Distil a teacher into a one-step ManiCM student; the same command goes on after Ctrl-C or a kill.",
 }
+# Commands with commands of their own.
+GROUPS = {"bench": "Time environments, decisions, experts and sensors; 'manicm-ms bench --help' lists what."}
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
@@ -76,9 +78,13 @@ def _run(arguments: list[str]) -> int | None:
         print(__version__)
         return 0
     name, rest = arguments[0], arguments[1:]
-    if name not in (*PLAIN, *WITH_PRESET):
-        raise UnknownNameError("command", name, (*PLAIN, *WITH_PRESET))
+    if name not in (*PLAIN, *WITH_PRESET, *GROUPS):
+        raise UnknownNameError("command", name, (*PLAIN, *WITH_PRESET, *GROUPS))
     with warnings_in_one_line():
+        if name in GROUPS:
+            from manicm_ms.cli import bench
+
+            return bench.run(rest)
         return tyro.cli(
             checked(command_of(name, rest)), prog=f"{PROGRAM} {name}", args=rest, config=(tyro.conf.OmitArgPrefixes,)
         )
@@ -99,5 +105,5 @@ def _overview() -> None:
     print(f"usage: {PROGRAM} COMMAND ...   ('{PROGRAM} COMMAND --help' tells more)\n")
     plain = {name: (command.__doc__ or "").splitlines()[0] for name, command in PLAIN.items()}
     width = console().width
-    for name, summary in {**plain, **WITH_PRESET}.items():
+    for name, summary in {**plain, **WITH_PRESET, **GROUPS}.items():
         print(textwrap.fill(f"  {name:<9} {summary}", width, subsequent_indent=" " * 12, break_on_hyphens=False))

@@ -9,22 +9,17 @@ from __future__ import annotations
 
 import argparse
 import copy
-import sys
 import time
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import asdict, dataclass
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 import torch
+from kit import Budget, Results, part_arguments, results_of
 from torch import Tensor, nn
 
-sys.path.append(str(Path(__file__).resolve().parents[1]))  # bench_latency lies in scripts/
-
-from bench_latency import CHUNK, TEACHERS, door_spec
-from kit import Budget, Results, part_arguments, results_of
-
+from manicm_ms.bench.latency import CHUNK, TEACHERS, door_spec
 from manicm_ms.evaluation.latency import example_observation
 from manicm_ms.evaluation.machine import machine
 from manicm_ms.machine.devices import resolve_device

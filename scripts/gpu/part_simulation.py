@@ -102,11 +102,10 @@ def environment(variables: Mapping[str, str]) -> dict[str, str]:
 
 def rate(env_id: str, workers: int, steps: int, repetitions: int) -> dict[str, Any]:
     """Return the control steps of all rows per second, small random actions, at `workers` processes."""
-    sys.path.append(str(Path(__file__).resolve().parents[1]))
     import torch
-    from bench_env import in_turn, vec_player
 
     from manicm_ms import make_vec
+    from manicm_ms.bench.env import in_turn, vec_player
 
     torch.set_num_threads(1)
     env = make_vec(env_id, workers, "cpu", image_size=(SIZE, SIZE))

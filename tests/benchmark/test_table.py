@@ -185,7 +185,7 @@ def test_the_page_of_results_is_what_the_kept_outcomes_give(name):
     page = (DOCS / "benchmark.md").read_text()
     kept = json.loads((DOCS / "data" / f"benchmark_{name}.json").read_text())
     found = summarised(kept)
-    assert kept["schema_version"] == SCHEMA_VERSION, "scripts/renew_results.py brings it up to date"
+    assert kept["schema_version"] == SCHEMA_VERSION, "scripts/results/renew_results.py brings it up to date"
     tables = [main_table(found), highest_table(found)] if name == "highest" else [
         table for table in all_tables(found) if table.title != paper_table(found).title
     ]  # fmt: skip

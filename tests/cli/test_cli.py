@@ -75,7 +75,7 @@ def assert_one_line(result, *parts):
 def test_without_a_command_it_shows_all_of_them_and_fails():
     status, out, _ = outcome(program())
     assert status == USER_ERROR
-    assert [line.split()[0] for line in out.splitlines()[2:]] == list(COMMANDS)
+    assert [line.split()[0] for line in out.splitlines()[2:]] == [*COMMANDS, "bench"]
 
 
 def test_help_shows_the_same_and_succeeds(told):

@@ -11,7 +11,7 @@ import torch
 from point_mass_env import MAX_STEPS, SOUND
 
 pytest.importorskip("stable_baselines3", reason="Stable-Baselines3 is not installed (extra rl)")
-sys.path.insert(0, str(Path(__file__).resolve().parents[2] / "scripts"))
+sys.path.insert(0, str(Path(__file__).resolve().parents[2] / "scripts" / "examples"))
 
 import train_ppo
 from train_ppo import CURVE, HELD, SETTINGS, WEIGHTS, Held, IdlePlayer, Judge, Train, judge, load_player, play, train

@@ -13,8 +13,9 @@ REPO = Path(__file__).parents[2]
 RESULTS = REPO / "docs" / "results"
 
 
-def script(name):
-    spec = importlib.util.spec_from_file_location(name, REPO / "scripts" / f"{name}.py")
+def script(path):
+    name = Path(path).stem
+    spec = importlib.util.spec_from_file_location(name, REPO / "scripts" / path)
     module = importlib.util.module_from_spec(spec)
     sys.modules[name] = module  # dataclasses look their module up
     spec.loader.exec_module(module)
@@ -26,7 +27,7 @@ def kept(name):
 
 
 def test_the_tables_of_learning_are_those_of_the_kept_results():
-    page, table = (RESULTS / "learning.md").read_text(), script("results_table")
+    page, table = (RESULTS / "learning.md").read_text(), script("results/results_table.py")
     for label, name in (("10 one-sided", "one"), ("10 two-sided", "two"), ("40 two-sided", "two40")):
         results = renewed(kept(name))
         assert all(line in page for line in table.rows(label, results))
@@ -34,7 +35,7 @@ def test_the_tables_of_learning_are_those_of_the_kept_results():
 
 
 def test_the_real_world_page_is_that_of_the_kept_results():
-    assert (RESULTS / "real_world.md").read_text() == script("reproduce_real_world_table").page(kept("real_world"))
+    assert (RESULTS / "real_world.md").read_text() == script("reproduce_real_world_table.py").page(kept("real_world"))
 
 
 def rounded(value):
@@ -47,12 +48,14 @@ def rounded(value):
 
 
 def test_kept_results_hold_the_present_intervals():
-    renew = script("renew_results").renew
+    renew = script("results/renew_results.py").renew
     for path in (RESULTS / "data").glob("*.json"):
         if path.stem.startswith("benchmark_"):  # tests/benchmark/test_table.py compares these with their page
             continue
         results = kept(path.stem)
-        assert rounded(renew(results)) == rounded(results), "python scripts/renew_results.py docs/results/data/*.json"
+        assert rounded(renew(results)) == rounded(results), (
+            "python scripts/results/renew_results.py docs/results/data/*.json"
+        )
 
 
 def test_results_of_the_first_version_get_the_present_intervals_from_their_counts():

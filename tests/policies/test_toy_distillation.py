@@ -7,17 +7,17 @@ from pathlib import Path
 import pytest
 import torch
 
-SCRIPT = Path(__file__).parents[2] / "scripts" / "bench_toy.py"
+SCRIPT = Path(__file__).parents[2] / "scripts" / "results" / "toy_distillation.py"
 
 
 @pytest.fixture(scope="module")
 def toy():
-    spec = importlib.util.spec_from_file_location("bench_toy", SCRIPT)
+    spec = importlib.util.spec_from_file_location("toy_distillation", SCRIPT)
     module = importlib.util.module_from_spec(spec)
-    sys.modules["bench_toy"] = module
+    sys.modules["toy_distillation"] = module
     spec.loader.exec_module(module)
     yield module
-    del sys.modules["bench_toy"]
+    del sys.modules["toy_distillation"]
 
 
 @pytest.fixture(scope="module")

@@ -1,4 +1,4 @@
-"""The robot at a table with a cube, without a renderer; and the folder of scripts made importable."""
+"""The robot at a table with a cube, without a renderer; and the folders of scripts made importable."""
 
 from __future__ import annotations
 
@@ -12,8 +12,7 @@ import pytest
 import torch
 
 SCRIPTS = Path(__file__).resolve().parents[2] / "scripts"
-if str(SCRIPTS) not in sys.path:
-    sys.path.insert(0, str(SCRIPTS))
+sys.path[:0] = [str(SCRIPTS / "robot"), str(SCRIPTS / "results")]
 
 
 @pytest.fixture(scope="session")
@@ -29,7 +28,7 @@ def _made() -> Iterator[dict[Any, list[Any]]]:
 @pytest.fixture
 def make_robot_env(_made: dict[Any, list[Any]]) -> Any:
     """Return a factory of `GripperHoldEnv`, just reset; one that an earlier test has left is used again."""
-    from bench_gripper import make_env
+    from gripper_hold import make_env
 
     free = {key: list(envs) for key, envs in _made.items()}
 

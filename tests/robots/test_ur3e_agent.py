@@ -223,7 +223,7 @@ def test_arm_drives_are_the_real_efforts(make_robot_env: Any) -> None:
 
 
 def test_opening_follows_the_action(make_robot_env: Any) -> None:
-    from bench_gripper import pad_distance
+    from gripper_hold import pad_distance
 
     env = make_robot_env()
     for opening in (0.08, 0.05, 0.01, 0.0, OPENING_MAX):
@@ -252,7 +252,7 @@ def test_opening_target_moves_at_the_real_speed(make_robot_env: Any) -> None:
 
 
 def test_a_hold_neither_slips_nor_tilts(make_robot_env: Any) -> None:
-    from bench_gripper import measure_hold
+    from gripper_hold import measure_hold
 
     hold = measure_hold(0.04, seconds=1.5)
     assert max(hold.hold_slip, hold.shake_slip) < 1e-3
@@ -262,7 +262,7 @@ def test_a_hold_neither_slips_nor_tilts(make_robot_env: Any) -> None:
 
 
 def test_is_grasping(make_robot_env: Any) -> None:
-    from bench_gripper import grasp_and_lift
+    from gripper_hold import grasp_and_lift
 
     env = make_robot_env()
     assert not bool(env.agent.is_grasping(env.cube)[0])

@@ -7,10 +7,11 @@ import cv2
 import numpy as np
 import pytest
 import yaml
-from rendered_board import Studio, tool_poses
 from scipy.spatial.transform import RigidTransform, Rotation
-from synthetic_views import BOARD, INFRARED, SIZE, TRUTH, error, nudge, views
+from synthetic_views import BOARD, INFRARED, SIZE, views
 
+from manicm_ms.bench.calibration import TRUTH, error, nudge
+from manicm_ms.bench.rendered_board import Studio, tool_poses
 from manicm_ms.cli import USER_ERROR, main
 from manicm_ms.errors import CalibrationError, CameraError, ConfigError, OutputExistsError, UnknownNameError
 from manicm_ms.sensing.calibration import CharucoSpec, calibrate, print_board, solve_views

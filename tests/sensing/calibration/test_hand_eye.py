@@ -2,10 +2,11 @@
 
 import numpy as np
 import pytest
-from rendered_board import tool_poses
 from scipy.spatial.transform import RigidTransform, Rotation
-from synthetic_views import BOARD, INFRARED, TRUTH, error, nudge, project, views
+from synthetic_views import BOARD, INFRARED, project, views
 
+from manicm_ms.bench.calibration import TRUTH, error, nudge
+from manicm_ms.bench.rendered_board import tool_poses
 from manicm_ms.errors import CalibrationError
 from manicm_ms.sensing.calibration import hand_eye
 from manicm_ms.sensing.calibration.hand_eye import (

@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import cv2
 import numpy as np
+from numpy.typing import ArrayLike, NDArray
 from scipy.spatial.transform import RigidTransform, Rotation
 
-import manicm_ms.machine.vulkan
 from manicm_ms.paths import asset
 from manicm_ms.sensing.calibration.board import CharucoSpec
 from manicm_ms.sensing.calibration.hand_eye import Pinhole
@@ -19,16 +21,18 @@ TEXTURE_PX_PER_M = 8000
 T_OPENCV_SAPIEN = np.array([[0, -1, 0], [0, 0, -1], [1, 0, 0]], dtype=float)  # x forward, y left, z up
 
 
-def look_at(eye, target) -> RigidTransform:
-    """T_base_camera with OpenCV's axes: z from eye to target, y as far down as can be."""
+def look_at(eye: ArrayLike, target: ArrayLike) -> RigidTransform:
+    """Return T_base_camera with OpenCV's axes: z from eye to target (3,), m, y as far down as can be."""
     z = np.subtract(target, eye) / np.linalg.norm(np.subtract(target, eye))
     x = np.cross(z, [0, 0, 1.0])
     x /= np.linalg.norm(x)
     return RigidTransform.from_components(eye, Rotation.from_matrix(np.column_stack([x, np.cross(z, x), z])))
 
 
-def tool_poses(camera: RigidTransform, T_tool_board: RigidTransform, spec: CharucoSpec, views: int, seed: int):
-    """T_base_tool of views of the whole board from 0.42 to 0.62 m, tilted by up to 35 degrees in any direction."""
+def tool_poses(
+    camera: RigidTransform, T_tool_board: RigidTransform, spec: CharucoSpec, views: int, seed: int
+) -> list[RigidTransform]:
+    """Return T_base_tool of views of the whole board from 0.42 to 0.62 m, tilted by up to 35 degrees in any way."""
     rng = np.random.default_rng(seed)
     centre = RigidTransform.from_translation([-spec.size[0] / 2, -spec.size[1] / 2, 0])
     poses = []
@@ -50,6 +54,13 @@ class Studio:
 
     The shader is the project's own, which compiles in a tenth of a second; or one of SAPIEN's by name ("default": lit,
     and half a minute to compile on two cores).
+
+    Args:
+        spec: the board.
+        T_base_camera: pose of the camera, OpenCV's axes.
+        intrinsics: of its pictures, pixels.
+        size: (width, height) of its pictures, pixels.
+        shader: None or a name.
     """
 
     def __init__(
@@ -59,8 +70,7 @@ class Studio:
         intrinsics: Pinhole,
         size: tuple[int, int],
         shader: str | None = None,
-    ):
-        manicm_ms.machine.vulkan.prepare()
+    ) -> None:
         import sapien
 
         self.sapien, self.size = sapien, size
@@ -85,17 +95,18 @@ class Studio:
         turn = T_base_camera.rotation * Rotation.from_matrix(T_OPENCV_SAPIEN)
         self.camera.entity.set_pose(sapien.Pose(T_base_camera.translation, turn.as_quat(scalar_first=True)))
 
-    def picture(self, T_base_board: RigidTransform) -> np.ndarray:
-        """(H, W, 3) uint8, BGR."""
+    def picture(self, T_base_board: RigidTransform) -> NDArray[np.uint8]:
+        """Return a photograph of the board at this pose, (H, W, 3) uint8, BGR."""
         quaternion = T_base_board.rotation.as_quat(scalar_first=True)
         self.board.set_pose(self.sapien.Pose(T_base_board.translation, quaternion))
         self.scene.update_render()
         self.camera.take_picture()
         rgb = self.camera.get_picture("Color")[..., :3]
         image = rgb if rgb.dtype == np.uint8 else np.clip(np.round(255 * rgb), 0, 255).astype(np.uint8)
-        return cv2.cvtColor(cv2.resize(image, self.size, interpolation=cv2.INTER_AREA), cv2.COLOR_RGB2BGR)
+        small = cv2.resize(image, self.size, interpolation=cv2.INTER_AREA)
+        return cv2.cvtColor(small, cv2.COLOR_RGB2BGR).astype(np.uint8, copy=False)
 
-    def _board(self, spec: CharucoSpec):
+    def _board(self, spec: CharucoSpec) -> Any:
         render = self.sapien.render
         rim = round(MARGIN_M * TEXTURE_PX_PER_M)
         grey = cv2.copyMakeBorder(spec.picture(TEXTURE_PX_PER_M), rim, rim, rim, rim, cv2.BORDER_CONSTANT, value=255)
@@ -123,7 +134,7 @@ class Studio:
         self.scene.add_entity(entity)
         return entity
 
-    def _surroundings(self):
+    def _surroundings(self) -> None:
         builder = self.scene.create_actor_builder()
         builder.add_box_visual(half_size=[0.6, 0.6, 0.02], material=[0.45, 0.35, 0.25])
         builder.set_initial_pose(self.sapien.Pose([0.3, 0, -0.02]))

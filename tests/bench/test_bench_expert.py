@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 import torch
 
-import bench_expert  # isort: skip  (the conftest makes scripts importable)
-
+from manicm_ms.bench import expert as bench_expert
+from manicm_ms.cli import main
 from manicm_ms.demos.experts import EXPERTS
 from manicm_ms.envs.chunk import ActionChunk
 from manicm_ms.envs.simulator import ENVS, SimulatorConfig
@@ -93,9 +93,10 @@ def test_episodes_on_disk_are_not_played_again(tmp_path):
     assert [episode.seed for episode in again] == [0, 1]
     np.testing.assert_allclose(again[1].joint_torque, both[1].joint_torque)
     assert first[0].joint_speed.shape == (6,)
-    page = bench_expert._page(2, {"ur3e/slide-block": again})
+    page = bench_expert._page(2, {"ur3e/slide-block": again}, "manicm-ms bench expert --episodes 2")
     assert "2/2" in page
     assert "| elbow | 28.0 |" in page
+    assert page.endswith("Made by `manicm-ms bench expert --episodes 2`.\n")
 
 
 @pytest.mark.parametrize(
@@ -106,13 +107,12 @@ def test_episodes_on_disk_are_not_played_again(tmp_path):
         (["--episodes", "0"], "at least 1"),
     ],
 )
-def test_bad_input_is_one_line_and_plays_nothing(words, said, tmp_path, monkeypatch, capsys):
+def test_bad_input_is_one_line_and_plays_nothing(words, said, tmp_path, capsys):
     records = tmp_path / "records"
-    monkeypatch.setattr("sys.argv", ["bench_expert.py", "--records", str(records), *words])
     with pytest.raises(SystemExit) as end:
-        bench_expert.main()
+        main(["bench", "expert", "--records", str(records), *words])
     assert end.value.code == 2
     (line,) = capsys.readouterr().err.splitlines()
-    assert line.startswith("bench_expert.py: ")
+    assert line.startswith("manicm-ms: ")
     assert said in line
     assert not records.exists()
