@@ -12,9 +12,10 @@ from typing import Literal
 
 import tyro
 
-from manicm_ms.cli import USER_ERROR, this_command
+from manicm_ms.cli import USER_ERROR
 from manicm_ms.cli.counts import Count, Seed, checked
 from manicm_ms.cli.messages import PROGRAM
+from manicm_ms.cli.options import this_command
 from manicm_ms.errors import ConfigError, UnknownNameError
 
 NAME = "bench"
