@@ -16,7 +16,8 @@ from manicm_ms.errors import CalibrationError
 from manicm_ms.sensing.calibration import CharucoSpec, solve_views
 from manicm_ms.sensing.calibration.board import detect
 from manicm_ms.sensing.calibration.hand_eye import HandEye, Pinhole, View
-from manicm_ms.sensing.camera_model import CameraModel, Crop, default_camera
+from manicm_ms.sensing.camera import CameraModel, Crop
+from manicm_ms.sensing.camera_files import default_camera
 
 TRUTH = HandEye(
     look_at((0.710, 0.280, 0.432), (0.31, 0.0, 0.15)),

@@ -17,7 +17,9 @@ from torch import Tensor
 
 from manicm_ms.bench.pages import publish, results_page
 from manicm_ms.errors import require_at_least
-from manicm_ms.sensing.camera_model import CameraModel, default_camera, depth_to_cloud
+from manicm_ms.sensing.camera import CameraModel
+from manicm_ms.sensing.camera_files import default_camera
+from manicm_ms.sensing.depth_cloud import depth_to_cloud
 from manicm_ms.sensing.point_cloud import Box
 from manicm_ms.sensing.stereo_depth import StereoDepth
 

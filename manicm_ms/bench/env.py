@@ -17,10 +17,12 @@ import psutil
 import torch
 
 from manicm_ms.bench.pages import results_page
+from manicm_ms.envs.backends import resolve_backend
 from manicm_ms.envs.chunk import ActionChunk
 from manicm_ms.envs.maniskill import ManiSkillSimulator
 from manicm_ms.envs.simulator import ENVS, SimulatorConfig
-from manicm_ms.envs.vec_env import VecEnv, make_vec, resolve_backend
+from manicm_ms.envs.vec_env import make_vec
+from manicm_ms.envs.vector import VecEnv
 from manicm_ms.envs.worker import RowEnv
 from manicm_ms.machine import vulkan
 from manicm_ms.paths import write_text

@@ -33,7 +33,8 @@ from torch import Tensor
 
 from manicm_ms.demos.experts import EXPERTS
 from manicm_ms.envs.sb3 import AbsorbingSuccess, StableBaselinesEnv, normalized_return
-from manicm_ms.envs.vec_env import VecEnv, make_vec
+from manicm_ms.envs.vec_env import make_vec
+from manicm_ms.envs.vector import VecEnv
 from manicm_ms.errors import ConfigError, ManicmError
 from manicm_ms.evaluation.intervals import rate_interval
 from manicm_ms.machine.devices import torch_threads

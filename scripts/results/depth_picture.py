@@ -18,7 +18,8 @@ from torch import Tensor
 from manicm_ms.demos.experts import EXPERTS
 from manicm_ms.envs.maniskill import workspace_of
 from manicm_ms.envs.vec_env import make_vec
-from manicm_ms.sensing.camera_model import default_camera, depth_to_cloud
+from manicm_ms.sensing.camera_files import default_camera
+from manicm_ms.sensing.depth_cloud import depth_to_cloud
 from manicm_ms.sensing.stereo_depth import StereoDepth
 from manicm_ms.spec import DEPTH, IMAGE, STATE
 

@@ -14,7 +14,8 @@ import tyro
 from PIL import Image
 
 from manicm_ms.demos.experts import EXPERTS
-from manicm_ms.envs.vec_env import VecEnv, make_vec
+from manicm_ms.envs.vec_env import make_vec
+from manicm_ms.envs.vector import VecEnv
 from manicm_ms.spec import AGENT_POS, STATE
 
 EVERY = 2  # control steps a frame: 10 frames a second at 20 Hz
