@@ -19,11 +19,12 @@ import torch
 from manicm_ms.bench.pages import results_page
 from manicm_ms.envs.backends import resolve_backend
 from manicm_ms.envs.chunk import ActionChunk
-from manicm_ms.envs.maniskill import ManiSkillSimulator
+from manicm_ms.envs.maniskill import ManiSkillSimulator, gym_id
 from manicm_ms.envs.simulator import ENVS, SimulatorConfig
 from manicm_ms.envs.vec_env import make_vec
 from manicm_ms.envs.vector import VecEnv
 from manicm_ms.envs.worker import RowEnv
+from manicm_ms.errors import require_at_least
 from manicm_ms.machine import vulkan
 from manicm_ms.paths import write_text
 
@@ -250,9 +251,17 @@ def measure(env_id: str, backend: str, counts: Sequence[int], repetitions: int, 
         repetitions: of each run; medians and best are taken over them.
         write: whether to keep the page.
         command: what the page names as its origin.
+
+    Raises:
+        ConfigError: a backend that cannot run here, an environment that is not one of ManiSkill, a count below 1, or
+            a page to keep outside of a checkout.
+        UnknownNameError: an unknown environment.
     """
     page = results_page(PAGES[backend]) if write else None
     resolve_backend(backend)
+    gym_id(env_id)  # what cannot be measured is refused before anything is
+    for count in counts:
+        require_at_least(1, num_envs=count)
     torch.set_num_threads(1)  # as in a worker; more of them would fight the software renderer
     sections = {"Machine": f"At the start: {machine()}."}
     if backend == "cpu":

@@ -19,6 +19,25 @@ def test_a_missing_gpu_is_named_in_one_line(capsys):
     assert out == ""
 
 
+@pytest.mark.parametrize(
+    ("words", "said"),
+    [
+        (["--env", "ur3e/slide-blok"], "did you mean 'ur3e/slide-block'"),
+        (["--env", "adroit/door"], "adroit/door does not run on ManiSkill"),
+        (["--num-envs", "2", "0"], "num_envs must be at least 1, got 0"),
+        (["--repetitions", "0"], "--repetitions must be at least 1"),
+    ],
+)
+def test_bad_input_is_one_line_and_measures_nothing(words, said, capsys):
+    with pytest.raises(SystemExit) as end:
+        main(["bench", "env", *words])
+    assert end.value.code == 2
+    out, err = capsys.readouterr()
+    (line,) = [line for line in err.splitlines() if line.startswith("manicm-ms: ")]
+    assert said in line
+    assert out == ""
+
+
 def test_the_parts_of_a_workers_step_are_all_found():
     """They are watched by name: one that has another name now must not drop out of the table unseen."""
     parts = shares("ur3e/slide-block", steps=3)
