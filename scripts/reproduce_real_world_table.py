@@ -2,7 +2,7 @@
 
 Every policy plays the same seeds under three realism presets; the teacher in one step stands beside them as control.
 
-python scripts/reproduce_real_world_table.py --write                # 200 held-out seeds a task; resumes
+python scripts/reproduce_real_world_table.py --write                # 100 held-out seeds a task; resumes
 python scripts/reproduce_real_world_table.py --tasks slide_block --episodes 20
 
 Reads checkpoints/TASK/{teacher,student}; reports and records go to runs/real_world/TASK.
@@ -238,7 +238,7 @@ def _machine(machine: dict[str, Any]) -> str:
 
 def main(
     tasks: tuple[str, ...] = tuple(TASKS),
-    episodes: int = 200,
+    episodes: int = 100,
     seed: int = SEED,
     checkpoints: Path = REPO / "checkpoints",
     out: Path = REPO / "runs" / "real_world",
