@@ -2,7 +2,7 @@
 
 Every policy plays the same seeds under three realism presets; the teacher in one step stands beside them as control.
 
-python scripts/reproduce_real_world_table.py --write                # 200 held-out seeds a task; resumes
+python scripts/reproduce_real_world_table.py --write                # 100 held-out seeds a task; resumes
 python scripts/reproduce_real_world_table.py --tasks slide_block --episodes 20
 
 Reads checkpoints/TASK/{teacher,student}; reports and records go to runs/real_world/TASK.
@@ -197,10 +197,10 @@ def page(data: dict[str, Any]) -> str:
     return f"""# The paper's real-world table, in simulation
 
 Left the paper's figures ({SOURCE}: {PAPER_TRIALS} trials on a UR3e with an AG-95 and a D435i, decisions on an RTX
-4090), right those of the pairs in `checkpoints/`, as committed, in the simulated task: seeds {first["seeds"][0]} to
-{first["seeds"][1]}, far from those of the demonstrations, every policy on the same ones. They play under three presets
-([guide](../guides/realism.md)): the ideal camera (`clean`), the errors of a depth camera (`d435i`), and these in a
-randomised cell (`d435i+dr`), under which the demonstrations were collected. How the pairs were trained:
+4090), right those of the pairs in `checkpoints/`, as committed, in the simulated task: as many seeds as the cells say,
+from {first["seeds"][0]} on, far from those of the demonstrations, every policy of a task on the same ones. They play
+under three presets ([guide](../guides/realism.md)): the ideal camera (`clean`), the errors of a depth camera (`d435i`),
+and these in a randomised cell (`d435i+dr`), under which the demonstrations were collected. How the pairs were trained:
 [robust_pairs.md](robust_pairs.md).
 
 {table(data)}
@@ -238,7 +238,7 @@ def _machine(machine: dict[str, Any]) -> str:
 
 def main(
     tasks: tuple[str, ...] = tuple(TASKS),
-    episodes: int = 200,
+    episodes: int = 100,
     seed: int = SEED,
     checkpoints: Path = REPO / "checkpoints",
     out: Path = REPO / "runs" / "real_world",
