@@ -63,6 +63,6 @@ def make_fabric(device: torch.device, precision: str, num_devices: int = 1) -> F
     devices = [device.index] if device.type == "cuda" and num_devices == 1 else num_devices
     strategy = "auto" if num_devices == 1 else "ddp"
     plugin = _precision_plugin(precision, device)
-    fabric = Fabric(accelerator=device.type, devices=devices, strategy=strategy, plugins=plugin)  # type: ignore[arg-type]
+    fabric = Fabric(accelerator=device.type, devices=devices, strategy=strategy, plugins=plugin)
     fabric.launch()
     return fabric
