@@ -14,7 +14,6 @@ from typing import Any
 import numpy as np
 import torch
 from numpy.typing import NDArray
-from rich.progress import track
 
 from manicm_ms.bench.pages import publish, results_page
 from manicm_ms.demos.experts import EXPERTS, Expert, require_style
@@ -23,6 +22,7 @@ from manicm_ms.envs.maniskill import ManiSkillSimulator
 from manicm_ms.envs.simulator import ENVS, SimulatorConfig
 from manicm_ms.errors import ConfigError
 from manicm_ms.evaluation.intervals import rate_interval
+from manicm_ms.progress import progress_of
 from manicm_ms.robots.ur3e_ag95 import ARM_JOINTS, JOINT_EFFORT, JOINT_SPEED
 from manicm_ms.spec import STATE
 
@@ -172,7 +172,7 @@ def run(env_id: str, style: str, seeds: range, records: Path) -> list[EpisodeMot
         records.parent.mkdir(parents=True, exist_ok=True)
         with records.open("a", encoding="utf-8") as file:
             file.write("\n" * _cut_short(records))
-            for seed in track(missing, description=f"{env_id} {style}"):
+            for seed in progress_of(missing, f"{env_id} {style}"):
                 known[seed] = play(rows, expert, meter, seed)
                 file.write(json.dumps(asdict(known[seed]), default=np.ndarray.tolist) + "\n")
                 file.flush()
