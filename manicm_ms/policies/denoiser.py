@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
-from typing import Protocol
+from typing import TYPE_CHECKING, Protocol
 
 import torch
 from torch import Tensor, nn
@@ -16,6 +16,9 @@ from manicm_ms.policies.points import POINT_CHOICES
 from manicm_ms.policies.unet1d import UNet1D
 from manicm_ms.registry import Registry
 from manicm_ms.spec import ACTION, AGENT_POS, POINT_CLOUD, ChunkSpec, EnvSpec
+
+if TYPE_CHECKING:
+    from manicm_ms.policies.base import ChannelStats
 
 
 @dataclass(frozen=True)
@@ -40,6 +43,8 @@ class NetworkConfig:
             this field act on the prefix.
         training_points: which ones in training, so that a student learns from points like its teacher's. Checkpoints
             older than this field were trained on random ones.
+        min_state_range: least range of a channel of agent_pos, in the channel's unit, when the normaliser is fitted;
+            0 is DP3's rule. Checkpoints hold the fitted normaliser, so this changes none of them.
     """
 
     down_dims: tuple[int, ...] = (512, 1024, 2048)
@@ -56,6 +61,7 @@ class NetworkConfig:
     max_points: int | None = None
     acting_points: str = "prefix"
     training_points: str = "random"
+    min_state_range: float = 0.0
 
     def __post_init__(self) -> None:
         CLOUD_FRAMES.get(self.cloud_frame)
@@ -73,6 +79,8 @@ class NetworkConfig:
             raise ConfigError(f"max_points must be at least 1 or None, got {self.max_points}")
         if not self.cloud_scale > 0:
             raise ConfigError(f"cloud_scale must be above 0 m, got {self.cloud_scale}")
+        if not self.min_state_range >= 0:
+            raise ConfigError(f"min_state_range must be at least 0, got {self.min_state_range}")
 
 
 class CloudFrame(Protocol):
@@ -172,6 +180,10 @@ class ConditionedDenoiser(nn.Module):
     def cond_dim(self) -> int:
         """Features of an observation."""
         return self.encoder.out_features
+
+    def fit_normalizer(self, stats: Mapping[str, ChannelStats]) -> None:
+        """Set the normaliser from the ranges of `point_cloud`, `agent_pos` and `action`, each in its unit."""
+        self.normalizer.fit(stats, {AGENT_POS: self.config.min_state_range})
 
     def encode(self, obs: Mapping[str, Tensor]) -> Tensor:
         """Return the features of raw observations, of which the first `max_points` points are read.

@@ -228,7 +228,7 @@ class DiffusionPolicy(Policy):
 
     def fit_normalizer(self, stats: Mapping[str, ChannelStats]) -> None:
         """Set the normaliser from the ranges of `point_cloud`, `agent_pos` and `action`."""
-        self.network.normalizer.fit(stats)
+        self.network.fit_normalizer(stats)
 
     def add_noise(self, x0: Tensor, epsilon: Tensor, t: Tensor) -> Tensor:
         """Return x_t = sqrt(abar_t) x0 + sqrt(1 - abar_t) epsilon, all (B, Tp, Da), for integer times t (B,)."""

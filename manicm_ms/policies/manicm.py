@@ -148,7 +148,7 @@ class ManiCM(Policy):
 
     def fit_normalizer(self, stats: Mapping[str, ChannelStats]) -> None:
         """Set the normaliser from the ranges of `point_cloud`, `agent_pos` and `action`."""
-        self.network.normalizer.fit(stats)
+        self.network.fit_normalizer(stats)
 
     def consistency_function(self, x_t: Tensor, t: Tensor, cond: Tensor) -> Tensor:
         """Return f(x_t, t), as it is trained; whether x0 is clipped there, `Prediction.student_x0` says.

@@ -24,6 +24,9 @@ class Normalizer(nn.Module):
     value becomes 0 (DP3, `LinearNormalizer` in mode "limits"). Values outside the fitted range are not
     clipped. Scale and offset are buffers: they are saved, and no optimizer sees them.
 
+    A field may have a least range: a channel that moves less is mapped about its middle as if it moved that far, so
+    that a millimetre of it is not the whole input.
+
     Args:
         channels: field -> number of channels C (its last axis). Unfitted fields map to themselves.
     """
@@ -35,11 +38,12 @@ class Normalizer(nn.Module):
             self.register_buffer(f"{name}_scale", torch.ones(count))
             self.register_buffer(f"{name}_offset", torch.zeros(count))
 
-    def fit(self, stats: Mapping[str, ChannelStats]) -> None:
+    def fit(self, stats: Mapping[str, ChannelStats], least_ranges: Mapping[str, float] | None = None) -> None:
         """Set all fields from their ranges.
 
         Args:
             stats: field -> object with `min` and `max`, each (C,) in the field's unit.
+            least_ranges: field -> least range of its channels in its unit; DP3's rule for a field that is not named.
 
         Raises:
             SpecMismatchError: a field is missing, has another number of channels or a value that is not finite.
@@ -56,9 +60,8 @@ class Normalizer(nn.Module):
             span = high - low
             if not torch.isfinite(span).all() or (span < 0).any():
                 raise SpecMismatchError(f"the statistics of {name!r} are not finite ranges: min {low}, max {high}")
-            constant = span < MIN_RANGE
-            gain = torch.where(constant, torch.ones_like(span), 2.0 / span.clamp_min(MIN_RANGE))
-            shift = torch.where(constant, -low, -1.0 - gain * low)
+            least = (least_ranges or {}).get(name, 0.0)
+            gain, shift = _about_the_middle(low, high, least) if least else _from_limits(low, high)
             scale.copy_(gain)
             offset.copy_(shift)
 
@@ -76,3 +79,17 @@ class Normalizer(nn.Module):
         if field not in self.fields:
             raise ConfigError(f"the normaliser has no field {field!r}: known: {', '.join(self.fields)}")
         return getattr(self, f"{field}_scale"), getattr(self, f"{field}_offset")
+
+
+def _from_limits(low: Tensor, high: Tensor) -> tuple[Tensor, Tensor]:
+    """Return scale and offset (C,) of DP3's rule: [low, high] becomes [-1, 1], a constant channel 0."""
+    span = high - low
+    constant = span < MIN_RANGE
+    gain = torch.where(constant, torch.ones_like(span), 2.0 / span.clamp_min(MIN_RANGE))
+    return gain, torch.where(constant, -low, -1.0 - gain * low)
+
+
+def _about_the_middle(low: Tensor, high: Tensor, least: float) -> tuple[Tensor, Tensor]:
+    """Return scale and offset (C,) that map [low, high] to [-1, 1], or less where it is narrower than `least`."""
+    gain = 2.0 / (high - low).clamp_min(least)
+    return gain, -gain * (low + high) / 2

@@ -29,6 +29,8 @@ class TeacherPreset(FitConfig):
         acting_points: which ones when acting: "prefix" (clouds are stored in farthest-point order, so a prefix is a
             coarser cloud) or "random" (drawn anew for each decision, from its noise).
         training_points: which ones in each step of training: "random" or "prefix".
+        min_state_range: least range of a channel of agent_pos in its unit (metres, radians, entries of a rotation): a
+            channel that moves less in the demonstrations is not stretched to [-1, 1]. 0 stretches it, as DP3 does.
         down_dims: channels of the U-Net's stages, or None for the policy's own.
         ema_power: of the averaged weights, which are the teacher in the end; see `PowerDecay`.
         ema_max_decay: never keep more than this of the old average.
@@ -44,6 +46,7 @@ class TeacherPreset(FitConfig):
     points: int | None = None
     acting_points: str = "prefix"
     training_points: str = "random"
+    min_state_range: float = 0.0
     down_dims: tuple[int, ...] | None = None
     ema_power: float = 0.75
     ema_max_decay: float = 0.9999
@@ -57,6 +60,8 @@ class TeacherPreset(FitConfig):
         POINT_CHOICES.get(self.training_points)
         if self.cloud_scale <= 0:
             raise ConfigError(f"cloud_scale must be positive (metres), got {self.cloud_scale}")
+        if not self.min_state_range >= 0:
+            raise ConfigError(f"min_state_range must be at least 0, got {self.min_state_range}")
         _ = self.chunk  # checks the three lengths against each other
 
     @property
@@ -93,7 +98,7 @@ class StudentPreset(FitConfig):
             raise ConfigError(f"mu must lie in [0, 1), got {self.mu}")
 
 
-_ADDED_LATER = {"acting_points": "prefix", "training_points": "random"}
+_ADDED_LATER = {"acting_points": "prefix", "training_points": "random", "min_state_range": 0.0}
 """Fields that presets got after runs were made with them, with what those runs did."""
 
 
@@ -120,13 +125,21 @@ TEACHER_PRESETS.add(
         clip_norm=1.0,
         cloud_frame="auto",
         points=128,
+        min_state_range=0.02,
         down_dims=(64, 128, 256),
     ),
 )
 TEACHER_PRESETS.add(
     "smoke",  # some seconds: shows that everything runs, and learns next to nothing
     TeacherPreset(
-        steps=30, batch_size=16, warmup_steps=5, cloud_frame="auto", points=64, down_dims=(32, 64), save_every=15
+        steps=30,
+        batch_size=16,
+        warmup_steps=5,
+        cloud_frame="auto",
+        points=64,
+        min_state_range=0.02,
+        down_dims=(32, 64),
+        save_every=15,
     ),
 )
 TEACHER_PRESETS.add(

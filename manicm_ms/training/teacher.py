@@ -96,6 +96,7 @@ def build_teacher(policy_name: str, demos: Demos, preset: TeacherPreset, seed: i
         "max_points": preset.points,
         "acting_points": preset.acting_points,
         "training_points": preset.training_points,
+        "min_state_range": preset.min_state_range,
     }
     if preset.down_dims is not None:
         network["down_dims"] = preset.down_dims

@@ -86,3 +86,15 @@ def test_both_frames_of_the_history_and_both_inputs_matter():
             other = {k: v.clone() for k, v in obs.items()}
             other[key][:, frame] += 0.5
             assert (net.encode(other) - base).abs().amax(1).min() > 1e-3
+
+
+def test_least_range_holds_for_the_state_and_never_for_actions():
+    spec, least = make_spec(), 4.0  # every range of `stats` lies between 0.5 and 1.5
+    plain, held = network(spec), network(spec, min_state_range=least)
+    for field in ("point_cloud", "agent_pos", "action"):
+        low, high = (torch.as_tensor(getattr(stats(spec)[field], name)) for name in ("min", "max"))
+        share = (high - low) / least if field == "agent_pos" else torch.ones_like(low)
+        torch.testing.assert_close(held.normalizer.normalize(field, high), share)
+        torch.testing.assert_close(plain.normalizer.normalize(field, high), torch.ones_like(high))
+    with pytest.raises(ConfigError, match="min_state_range"):
+        network(spec, min_state_range=-1.0)

@@ -46,6 +46,19 @@ def test_a_channel_below_the_smallest_range_is_only_shifted():
     torch.testing.assert_close(y[:, 1], torch.tensor([-1.0, 1.0]), atol=1e-2, rtol=0)
 
 
+def test_a_channel_below_the_least_range_keeps_its_proportion():
+    values = torch.tensor([[5.0, 1.0, 2.0], [5.002, 3.0, 2.0]])
+    normalizer = Normalizer({"x": 3, "y": 3})
+    stats = field_stats(values[:, None].numpy())
+    normalizer.fit({"x": stats, "y": stats}, {"x": 0.02})
+    wide, constant = torch.tensor([-1.0, 1.0]), torch.zeros(2)
+    y = normalizer.normalize("x", values).T
+    torch.testing.assert_close(y, torch.stack([0.1 * wide, wide, constant]), atol=1e-3, rtol=0)
+    torch.testing.assert_close(normalizer.unnormalize("x", y.T), values, rtol=1e-5, atol=1e-5)
+    stretched = normalizer.normalize("y", values).T  # the field that is not named follows DP3's rule
+    torch.testing.assert_close(stretched, torch.stack([wide, wide, constant]), atol=1e-2, rtol=0)
+
+
 def test_state_is_in_buffers_not_in_parameters(data):
     normalizer = fitted(data)
     assert list(normalizer.parameters()) == []

@@ -30,7 +30,9 @@ def test_both_kinds_have_the_same_presets(registry):
 
 def test_a_field_added_later_does_not_make_an_older_run_another_one():
     quick = TEACHER_PRESETS.get("quick")
-    assert not {"acting_points", "training_points"} & set(preset_identity(quick))
+    older = replace(quick, min_state_range=0.0)
+    assert not {"acting_points", "training_points", "min_state_range"} & set(preset_identity(older))
+    assert preset_identity(quick)["min_state_range"] == 0.02
     assert preset_identity(replace(quick, acting_points="random"))["acting_points"] == "random"
     assert preset_identity(quick)["points"] == 128
 
