@@ -35,11 +35,15 @@ class Registry(Generic[T]):
         package: dotted name of a package whose modules are imported once, before the first look-up,
             so that their decorators run; None where all entries are registered by their importer.
         group: entry-point group of installed packages whose modules are imported then too; None for no such group.
+        outside: package of which a user's own modules are imported too, where `package` holds no such name; None where
+            users cannot add to it.
     """
 
-    def __init__(self, kind: str, package: str | None = None, group: str | None = None) -> None:
+    def __init__(
+        self, kind: str, package: str | None = None, group: str | None = None, outside: str | None = None
+    ) -> None:
         self.kind = kind
-        self._package, self._group = package, group
+        self._package, self._group, self._outside = package, group, outside
         self._entries: dict[str, T] = {}
         self._tags: dict[str, frozenset[str]] = {}
         self._former: dict[str, str] = {}
@@ -76,6 +80,8 @@ class Registry(Generic[T]):
     def get(self, name: str) -> T:
         """Return the entry called `name`; raise UnknownNameError with the nearest known name."""
         self._discover()
+        if name not in self._entries:
+            self._discover_outside()
         return self.get_registered(name)
 
     def get_registered(self, name: str) -> T:
@@ -87,6 +93,7 @@ class Registry(Generic[T]):
     def names(self, tag: str | None = None) -> tuple[str, ...]:
         """Return the known names in order of registration, only those carrying `tag` if it is given."""
         self._discover()
+        self._discover_outside()
         return tuple(n for n in self._entries if tag is None or tag in self._tags[n])
 
     def tags(self, name: str) -> frozenset[str]:
@@ -94,24 +101,48 @@ class Registry(Generic[T]):
         self.get(name)
         return self._tags[name]
 
+    def name_of(self, entry: T) -> str | None:
+        """Return the name that an entry of this registry has, or None where it has none."""
+        return next((name for name, known in self._entries.items() if known is entry), None)
+
     def _discover(self) -> None:
         if self._package is None:
             return
-        package, self._package = importlib.import_module(self._package), None
-        for module in pkgutil.iter_modules(package.__path__):
-            name = f"{package.__name__}.{module.name}"
-            if module.module_finder.path == package.__path__[0]:  # type: ignore[union-attr]
+        package, self._package = self._package, None
+        for name, ours in _modules(package):
+            if ours:
                 importlib.import_module(name)
-            elif name not in _left_out:
+            else:
                 _import_or_leave_out(name)
+        if self._outside is None:
+            self._discover_outside()
+
+    def _discover_outside(self) -> None:
+        """Import what is not ours: modules of the user's own, and those of installed packages."""
+        if self._outside is not None:
+            package, self._outside = self._outside, None
+            for name, ours in _modules(package):
+                if not ours:
+                    _import_or_leave_out(name)
         if self._group is not None:
-            for point in importlib.metadata.entry_points(group=self._group):
-                if point.module not in _left_out:
-                    _import_or_leave_out(point.module)
+            group, self._group = self._group, None
+            for point in importlib.metadata.entry_points(group=group):
+                _import_or_leave_out(point.module)
+
+
+def _modules(package: str) -> list[tuple[str, bool]]:
+    """Return the modules of a package, each with whether it lies in the package's own folder."""
+    found = importlib.import_module(package)
+    return [
+        (f"{package}.{module.name}", module.module_finder.path == found.__path__[0])  # type: ignore[union-attr]
+        for module in pkgutil.iter_modules(found.__path__)
+    ]
 
 
 def _import_or_leave_out(name: str) -> None:
-    """Import a module that is not ours; one that cannot be imported is named in one line and left out."""
+    """Import a module that is not ours; one that cannot be imported is named in one line, once, and left out."""
+    if name in _left_out:
+        return
     before = len(_entered)
     try:
         importlib.import_module(name)
@@ -121,7 +152,7 @@ def _import_or_leave_out(name: str) -> None:
         del _entered[before:]
         _left_out.add(name)
         file, line, what = where_it_failed(error, _origin(name))
-        warnings.warn(f"{file}, line {line}: {what}; its tasks are left out", TaskWarning, stacklevel=2)
+        warnings.warn(f"{file}, line {line}: {what}; what it registers is left out", TaskWarning, stacklevel=2)
 
 
 def _origin(name: str) -> str:

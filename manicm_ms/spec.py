@@ -8,9 +8,9 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass, field
-from typing import Any
+from typing import Any, NamedTuple
 
-from manicm_ms.errors import ConfigError, SpecMismatchError, require_at_least
+from manicm_ms.errors import ConfigError, SpecMismatchError, UnknownNameError, require_at_least
 
 POINT_CLOUD = "point_cloud"
 """(P, 3) or (P, 6) float32: xyz in metres in `ObsSpec.frame`, then rgb in [0, 1]."""
@@ -117,6 +117,24 @@ class ActionSpec:
         return len(self.names)
 
 
+ANY = -1
+"""Length of an axis that may differ from one producer to another: the points of a cloud."""
+
+
+class FieldSpec(NamedTuple):
+    """What one frame of an observation is.
+
+    Attributes:
+        shape: of a frame; `ANY` for an axis whose length is not fixed.
+        unit: of its values.
+        frame: frame of reference, one of `FRAMES`, or "" where it has none.
+    """
+
+    shape: tuple[int, ...]
+    unit: str
+    frame: str = ""
+
+
 @dataclass(frozen=True)
 class EnvSpec:
     """All that is fixed about an environment id.
@@ -154,6 +172,19 @@ class EnvSpec:
     def state_dim(self) -> int:
         """S, entries of the privileged state."""
         return max((stop for _, stop in self.state_layout.values()), default=0)
+
+    def observation(self, key: str) -> FieldSpec:
+        """Return what one frame of the observation `key` is; raise UnknownNameError where there is no such key."""
+        fields = {
+            POINT_CLOUD: FieldSpec((ANY, self.obs.point_channels), "m", self.obs.frame),
+            AGENT_POS: FieldSpec((self.obs.agent_pos_dim,), "as named"),
+            IMAGE: FieldSpec((*self.obs.image_size, 3), "0 to 255"),
+            DEPTH: FieldSpec(self.obs.image_size, "m"),
+            STATE: FieldSpec((self.state_dim,), "as named"),
+        }
+        if key not in fields:
+            raise UnknownNameError("observation", key, fields)
+        return fields[key]
 
     def to_dict(self) -> dict[str, Any]:
         """Return plain JSON values; `from_dict` is its inverse."""

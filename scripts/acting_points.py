@@ -7,6 +7,7 @@ the outcomes are pairs. Which choice a checkpoint acts on is `acting_points` in 
 from __future__ import annotations
 
 from pathlib import Path
+from typing import cast
 
 import tyro
 
@@ -16,25 +17,21 @@ from manicm_ms.envs.vector import VecEnv
 from manicm_ms.evaluation.rollout import RestartableEnv, rollout
 from manicm_ms.evaluation.statistics import compare_paired, success_rate
 from manicm_ms.machine.devices import torch_threads
+from manicm_ms.policies.action_policy import ActionPolicy
 from manicm_ms.policies.checkpoint import load_checkpoint
-from manicm_ms.policies.diffusion import DiffusionPolicy, OneStepTeacher
-from manicm_ms.policies.manicm import ManiCM
+from manicm_ms.policies.encoders.points import PointSubset
 
 CHOICES = ("prefix", "random")
 
 
-Player = DiffusionPolicy | OneStepTeacher | ManiCM
-
-
-def players(checkpoint: Path) -> dict[str, Player]:
+def players(checkpoint: Path) -> dict[str, ActionPolicy]:
     """Return the policy of a checkpoint, and of a teacher also its one-step control, by name."""
     policy = load_checkpoint(checkpoint)
     name = f"{checkpoint.resolve().parent.name}/{checkpoint.name}"
-    if isinstance(policy, DiffusionPolicy):
-        return {name: policy, f"{name}, one step": OneStepTeacher(policy)}
-    if not isinstance(policy, ManiCM):
+    if "points" not in policy.transforms:
         raise SystemExit(f"{checkpoint} holds a {policy.name}, which does not choose points")
-    return {name: policy}
+    control = policy.one_step()
+    return {name: policy} if control is None else {name: policy, f"{name}, one step": control}
 
 
 def main(
@@ -67,11 +64,11 @@ def main(
 
 
 def row(
-    name: str, policy: Player, env_id: str | None, seeds: range, realism: str, num_envs: int | None, backend: str
+    name: str, policy: ActionPolicy, env_id: str | None, seeds: range, realism: str, num_envs: int | None, backend: str
 ) -> str:
     """Play the seeds with each choice and return the row of the table."""
-    network, spec = policy.network, policy.spec
-    count = network.config.max_points
+    points, spec = cast(PointSubset, policy.transforms["points"]), policy.spec
+    count = points.config.max_points
     if count is None or count >= spec.obs.num_points:
         raise SystemExit(f"{name} reads all {spec.obs.num_points} points: there is nothing to choose")
 
@@ -90,7 +87,7 @@ def row(
     solved = {}
     try:
         for choice in CHOICES:
-            network.act_on(choice)
+            points.act_on(choice)
             solved[choice] = [episode.success for episode in rollout(env, policy, seeds)]
     finally:
         env.close()

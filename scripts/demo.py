@@ -1,4 +1,4 @@
-"""The main job: collect 10 demonstrations of Slide Block, train a teacher, distil it, judge the pair, show the table.
+"""The main job: collect 10 demonstrations of Slide Block, train a teacher, distil it, evaluate the pair.
 
 Each step is one command of the package, printed before it runs. Every step goes on where it was stopped, so that the
 whole can be interrupted and started again.

@@ -1,7 +1,7 @@
 """Write a trained pair in half precision, small enough to come with the repository.
 
 `python scripts/ship_pair.py runs/ship checkpoints/slide_block` turns runs/ship/{teacher,student} into
-checkpoints/slide_block/{teacher,student}. Judge what was written, not what it was made of: rounding changes weights.
+checkpoints/slide_block/{teacher,student}. Evaluate what was written, not what it was made of: rounding changes weights.
 """
 
 from __future__ import annotations

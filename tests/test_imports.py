@@ -127,11 +127,18 @@ def test_only_the_simulation_layers_import_a_simulator(name):
 def test_the_reader_of_imports_sees_every_form(tmp_path, monkeypatch):
     path = tmp_path / "probe.py"
     path.write_text(
-        "import sapien.physx\nfrom manicm_ms import errors\nfrom . import store\nfrom .windows import Windows\n"
+        "import sapien.physx\nfrom manicm_ms import errors\nfrom . import store\n"
+        "from .sequence_dataset import SequenceDataset\n"
         "def f():\n    import mujoco\n    importlib.import_module('metaworld')\n"
     )
     monkeypatch.setitem(MODULES, "manicm_ms.demos.probe", path)
-    expected = {"sapien.physx", "manicm_ms.errors", "manicm_ms.demos.store", "manicm_ms.demos.windows", "mujoco"}
+    expected = {
+        "sapien.physx",
+        "manicm_ms.errors",
+        "manicm_ms.demos.store",
+        "manicm_ms.demos.sequence_dataset",
+        "mujoco",
+    }
     assert imports("manicm_ms.demos.probe") == expected | {"metaworld"}
 
 

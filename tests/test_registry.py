@@ -25,6 +25,15 @@ def test_get_and_tags(fruits):
     assert fruits.names(tag="green") == ("pear",)
 
 
+def test_an_entry_knows_its_name(fruits):
+    apple, pear = object(), object()
+    objects = Registry("object")
+    objects.add("apple", apple)
+    assert objects.name_of(apple) == "apple"
+    assert objects.name_of(pear) is None
+    assert fruits.name_of(2) == "pear"
+
+
 def test_near_miss_is_suggested(fruits):
     with pytest.raises(UnknownNameError, match=r"unknown fruit 'aple': did you mean 'apple'\? known: apple, pear"):
         fruits.get("aple")
@@ -80,6 +89,7 @@ def test_a_broken_file_is_named_with_its_line_and_the_others_go_on(package, kind
         assert fruits.names() == ("shipped", "zest"), "and nothing of what the broken file had entered"
     (warning,) = told
     assert str(warning.message).startswith(f"{users / kind}.py, line {line}: {what}")
+    assert str(warning.message).endswith("; what it registers is left out")
     assert "\n" not in str(warning.message)
     with warnings.catch_warnings():
         warnings.simplefilter("error")  # said once, though experts are discovered after environments
@@ -111,3 +121,47 @@ def test_modules_of_installed_packages_are_found_by_their_entry_points(package, 
     assert lines[1].startswith("no_such_fruits.module, line 1: ModuleNotFoundError")
     for name in ("their_fruits", "their_broken_fruits"):
         sys.modules.pop(name, None)
+
+
+@pytest.fixture
+def outside(package, tmp_path, monkeypatch):
+    """A registry whose own entries lie in one package, and a user's beside the modules of another."""
+    _, users, own = package
+    parts = tmp_path / "parts_of_a_test"
+    parts.mkdir()
+    (parts / "__init__.py").touch()
+    (parts / "core.py").write_text(GOOD.format(name="core"))
+    (own / "shipped.py").write_text("raise AssertionError('a module of that package itself is none of ours')\n")
+    registry = Registry("fruit", package=parts.name, outside=own.name)
+    sys.modules["fruit_registry"].FRUITS = registry
+    yield registry, users, own
+    for name in [name for name in sys.modules if name.startswith(parts.name)]:
+        del sys.modules[name]
+
+
+def test_a_users_module_is_imported_only_where_a_name_is_not_ours(outside):
+    fruits, users, own = outside
+    (users / "zest.py").write_text(GOOD.format(name="zest"))
+    assert fruits.get("core") == 1
+    assert f"{own.name}.zest" not in sys.modules
+    assert fruits.get("zest") == 1
+    assert fruits.names() == ("core", "zest")
+
+
+def test_the_names_of_a_registry_are_those_of_the_users_modules_too(outside):
+    fruits, users, _ = outside
+    (users / "zest.py").write_text(GOOD.format(name="zest"))
+    assert fruits.names() == ("core", "zest")
+    with pytest.raises(UnknownNameError, match="did you mean 'zest'"):
+        fruits.get("zests")
+
+
+def test_a_users_broken_module_costs_what_is_ours_nothing(outside):
+    fruits, users, _ = outside
+    (users / "broken.py").write_text("import no_such_module\n")
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        assert fruits.get("core") == 1
+    with pytest.warns(TaskWarning, match=r"broken\.py, line 1: .*; what it registers is left out$") as told:
+        assert fruits.names() == ("core",)
+    assert len(told) == 1

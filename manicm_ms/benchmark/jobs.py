@@ -30,6 +30,7 @@ from manicm_ms.benchmark.plan import Plan
 from manicm_ms.demos.collect import collect
 from manicm_ms.demos.layout import store_path
 from manicm_ms.demos.store import DemoStore
+from manicm_ms.envs.env_request import EnvRequest
 from manicm_ms.errors import ConfigError
 from manicm_ms.evaluation.machine import machine
 from manicm_ms.evaluation.play import env_maker
@@ -201,7 +202,7 @@ class EvaluateJob(Job):
         """See `Job.work`."""
         plan, checkpoint = self.plan, self.plan.checkpoint(self.env_id, self.seed, self.method)
         policy = self.method.load(checkpoint, plan.device)
-        envs = env_maker(self.env_id, "auto", obs_preset=plan.obs_preset)
+        envs = env_maker(EnvRequest(env_id=self.env_id, obs_preset=plan.obs_preset))
         with closing(RestartableEnv(lambda: envs.for_policy(policy, plan.num_envs, CLEAN))) as env:
             fresh = self._play("fresh", checkpoint, policy, plan.fresh_seeds, env, console)
             evaluations = self._evaluate_snapshots(checkpoint, env, console)

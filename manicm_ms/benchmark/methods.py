@@ -11,10 +11,12 @@ from typing import TYPE_CHECKING, NamedTuple
 from rich.console import Console
 
 from manicm_ms.errors import ConfigError, UnknownNameError
-from manicm_ms.training.presets import STUDENT_PRESETS, TEACHER_PRESETS
+from manicm_ms.policies.methods import methods_of
+from manicm_ms.training.presets import STUDENT_PRESETS, preset_for
 
 if TYPE_CHECKING:
-    from manicm_ms.policies.base import Policy
+    from manicm_ms.policies.action_policy import ActionPolicy
+    from manicm_ms.policies.policy import Policy
 
 DEFAULT_TEACHER = "simple_dp3"
 
@@ -81,21 +83,21 @@ class Method(ABC):
 
 
 @dataclass(frozen=True)
-class Teacher(Method):
-    """A diffusion policy with all its network evaluations.
+class Trained(Method):
+    """What is trained on demonstrations: a row of the table of methods, with all its network evaluations.
 
     Attributes:
-        name: in `POLICIES`.
+        name: in `METHODS`.
     """
 
     name: str
 
     def train(self, out: Path, source: Path | None, training: Training) -> None:
         """See `Method.train`."""
-        from manicm_ms.training.teacher import train_teacher
+        from manicm_ms.training.train import train
 
-        train_teacher(
-            self.name, training.data, out, TEACHER_PRESETS.get(training.preset), device=training.device,
+        train(
+            self.name, training.data, out, preset_for(self.name, training.preset), device=training.device,
             seed=training.seed, snapshots=training.snapshots, console=training.console, command=training.command,
         )  # fmt: skip
 
@@ -109,7 +111,7 @@ class OneStep(Method):
     """The control: a teacher's network evaluated once, without distillation."""
 
     name: str
-    teacher: Teacher
+    teacher: Trained
 
     @property
     def made_from(self) -> Method | None:
@@ -126,11 +128,10 @@ class OneStep(Method):
 
     def load(self, checkpoint: Path, device: str) -> Policy:
         """See `Method.load`."""
-        from manicm_ms.policies.diffusion import DiffusionPolicy, OneStepTeacher
-
-        policy = _load(checkpoint, device)
-        assert isinstance(policy, DiffusionPolicy)
-        return OneStepTeacher(policy)
+        control = _load(checkpoint, device).one_step()
+        if control is None:
+            raise ConfigError(f"{self.teacher.name} has no one-step control: it is no diffusion teacher")
+        return control
 
 
 @dataclass(frozen=True)
@@ -143,7 +144,7 @@ class Student(Method):
     """
 
     name: str
-    teacher: Teacher
+    teacher: Trained
     nfe: int
 
     @property
@@ -153,7 +154,7 @@ class Student(Method):
 
     def train(self, out: Path, source: Path | None, training: Training) -> None:
         """See `Method.train`."""
-        from manicm_ms.training.student import distill
+        from manicm_ms.training.distill import distill
 
         assert source is not None
         distill(
@@ -167,7 +168,7 @@ class Student(Method):
         return _load(checkpoint, device)
 
 
-def _load(checkpoint: Path, device: str) -> Policy:
+def _load(checkpoint: Path, device: str) -> ActionPolicy:
     from manicm_ms.policies.checkpoint import load_checkpoint
 
     return load_checkpoint(checkpoint, device=device)
@@ -182,10 +183,10 @@ _MADE_FROM_TEACHER = {
 
 
 def method_names() -> tuple[str, ...]:
-    """Return the names of all methods: the teachers of `POLICIES`, and what is made of a teacher."""
-    from manicm_ms.policies.base import POLICIES
+    """Return the names of all methods: what is trained on demonstrations, and what is made of a teacher."""
+    from manicm_ms.training.objectives import trained_methods
 
-    return (*POLICIES.names("teacher"), *_MADE_FROM_TEACHER)
+    return (*trained_methods(), *_MADE_FROM_TEACHER)
 
 
 def parse_methods(names: Sequence[str]) -> tuple[Method, ...]:
@@ -198,7 +199,7 @@ def parse_methods(names: Sequence[str]) -> tuple[Method, ...]:
         UnknownNameError: no such method or teacher.
         ConfigError: none, one named twice, or a method whose teacher is not clear.
     """
-    teachers = [name for name in names if name not in _MADE_FROM_TEACHER and ":" not in name]
+    teachers = [name for name in names if name in methods_of("teacher")]
     if not names or len(set(names)) < len(names):
         raise ConfigError(f"name each method once, of {', '.join(method_names())}; got {', '.join(names) or 'none'}")
     return tuple(_method(name, teachers) for name in names)
@@ -212,11 +213,11 @@ def _method(name: str, teachers: Sequence[str]) -> Method:
     if kind not in _MADE_FROM_TEACHER:
         if teacher:
             raise ConfigError(f"{kind} is trained on demonstrations, not made from {teacher}: use {kind!r}")
-        return Teacher(kind)
+        return Trained(kind)
     if not teacher and len(teachers) > 1:
         raise ConfigError(f"{kind} of which teacher? write {' or '.join(f'{kind}:{t}' for t in teachers)}")
     chosen = teacher or (teachers[0] if teachers else DEFAULT_TEACHER)
-    possible = [n for n in known if n not in _MADE_FROM_TEACHER]
+    possible = methods_of("teacher")
     if chosen not in possible:
         raise UnknownNameError("teacher", chosen, possible)
-    return _MADE_FROM_TEACHER[kind](Teacher(chosen), name)
+    return _MADE_FROM_TEACHER[kind](Trained(chosen), name)

@@ -8,10 +8,11 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from manicm_ms.benchmark.methods import Method, parse_methods
+from manicm_ms.benchmark.methods import DEFAULT_TEACHER, Method, parse_methods
 from manicm_ms.errors import ConfigError
 from manicm_ms.seeds import require_seed
-from manicm_ms.training.presets import STUDENT_PRESETS, TEACHER_PRESETS, preset_identity
+from manicm_ms.training.presets import STUDENT_PRESETS, TEACHER_PRESETS
+from manicm_ms.training.settings import preset_identity
 
 if TYPE_CHECKING:
     from manicm_ms.envs.simulator import EnvEntry
@@ -133,14 +134,17 @@ class Plan:
     @property
     def identity(self) -> dict[str, Any]:
         """What the results depend on beside task, method and seed: one folder holds one of these."""
-        recipes = {"teacher": TEACHER_PRESETS.get(self.preset), "student": STUDENT_PRESETS.get(self.preset)}
+        recipes = {
+            "teacher": preset_identity(TEACHER_PRESETS.get(self.preset), DEFAULT_TEACHER),
+            "student": preset_identity(STUDENT_PRESETS.get(self.preset)),
+        }
         named = ("preset", "demos", "demo_seed", "colors", "obs_preset", "episodes", "eval_seed", "evaluations",
                  "evaluation_episodes", "device")  # fmt: skip
         return {
             **{name: getattr(self, name) for name in named},
             **({"to_the_end": True} if self.to_the_end else {}),  # folders of earlier versions lack it
             "data": str(self.data.resolve()),
-            "recipes": {name: preset_identity(recipe) for name, recipe in recipes.items()},
+            "recipes": recipes,
         }
 
     def to_json(self) -> str:

@@ -38,7 +38,7 @@ PLAIN: dict[str, Command] = {
 }
 # These depend on the preset that the command line names: its fields become options with its values as defaults.
 WITH_PRESET = {
-    "train": "Train a diffusion teacher on demonstrations; the same command goes on after Ctrl-C or a kill.",
+    "train": "Train a policy on demonstrations; the same command goes on after Ctrl-C or a kill.",
     "distill": "Distil a teacher into a one-step ManiCM student; the same command goes on after Ctrl-C or a kill.",
 }
 # Commands with commands of their own.
@@ -85,6 +85,10 @@ def _run(arguments: list[str]) -> int | None:
             from manicm_ms.cli import bench
 
             return bench.run(rest)
+        if name in WITH_PRESET:
+            from manicm_ms.cli.training import present_flags
+
+            rest = present_flags(rest)
         return tyro.cli(
             checked(command_of(name, rest)), prog=f"{PROGRAM} {name}", args=rest, config=(tyro.conf.OmitArgPrefixes,)
         )

@@ -38,14 +38,14 @@ def benchmark_command(
         methods: simple_dp3, dp3 (teachers), one_step (a teacher undistilled), manicm, manicm_4 (students), separated
             by commas; with two teachers, manicm:dp3 says of which.
         seeds: of the trainings, separated by commas.
-        preset: recipe of teacher and student; 'manicm-ms list presets' shows them.
+        preset: preset of teacher and student; 'manicm-ms list presets' shows them.
         out: folder of everything that is made.
         data: folder of the demonstrations, SUITE/TASK.zarr; by default OUT/data. What is missing is collected.
         demos: demonstrations to learn from.
         demo_seed: first seed of the demonstrations.
         colors: coloured clouds.
         obs_preset: manicm_ms, or dp3 for clouds and success as the public DP3 wrapper has them.
-        episodes: fresh seeds that each trained policy plays.
+        episodes: held-out seeds that each trained policy plays.
         eval_seed: first of them.
         evaluations: evaluations during training, for the paper's mean of the five highest; 0: none.
         evaluation_episodes: episodes of each of those.

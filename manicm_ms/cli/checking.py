@@ -28,7 +28,7 @@ def list_command(kind: tyro.conf.Positional[Literal["envs", "policies", "presets
 
 
 def check_command(env_ids: tyro.conf.Positional[tuple[str, ...]], backend: Backend = "auto") -> int:
-    """Check that environments keep the promises of the vector interface; exit status 1 where one is broken.
+    """Run the conformance checks of the vector interface on environments; exit status 1 where one fails.
 
     Args:
         env_ids: environment ids.

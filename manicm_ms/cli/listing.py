@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import textwrap
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import fields
 from typing import Any, NamedTuple
 
@@ -13,11 +13,7 @@ from rich.table import Table
 from manicm_ms.errors import UnknownNameError
 
 _FILE_WIDTH = 1000  # columns of what is not read on a terminal: a table takes as many as it needs
-_POLICIES = {
-    "dp3": "DP3's diffusion teacher: a U-Net of 512, 1024 and 2048 channels, evaluated 10 times a decision.",
-    "simple_dp3": "Simple DP3's diffusion teacher: the same with a U-Net of 128, 256 and 384 channels.",
-    "manicm": "ManiCM's student, distilled from either teacher: evaluated once a decision.",
-}
+_SHOWN_METHOD = "simple_dp3"
 _NONE = {"points": "all", "down_dims": "the policy's", "clip_norm": "no clipping"}
 """What None means in a preset's field; elsewhere, that the field does not apply."""
 
@@ -84,25 +80,46 @@ def envs(tag: str | None = None) -> list[Listing]:
 
 
 def policies() -> list[Listing]:
-    """Return the policies with one sentence on each."""
-    from manicm_ms.policies.base import POLICIES
+    """Return the table of methods: parts, lengths, network evaluations, and one sentence on each."""
+    from manicm_ms.policies.methods import METHODS
 
-    sentences = {name: (POLICIES.get(name).__doc__ or "").strip().partition("\n")[0] for name in POLICIES.names()}
-    return [Listing(("policy", "what it is"), [(name, _POLICIES.get(name, line)) for name, line in sentences.items()])]
+    rows = []
+    for name in METHODS.names():
+        row = METHODS.get(name)
+        parts = [_part(part) for part in (row.encoder, row.backbone, row.head)]
+        chunk = f"{row.chunk.n_obs_steps}, {row.chunk.horizon}, {row.chunk.n_action_steps}"
+        rows.append((name, *parts, row.objective, chunk, str(row.nfe), row.sentence, row.reference))
+    headers = ("policy", "encoder", "backbone", "head", "objective", "To, Tp, Ta", "NFE", "what it is", "reference")
+    return [Listing(headers, rows)]
+
+
+def _part(part: Any) -> str:
+    return str(part["name"] if isinstance(part, Mapping) else part or "-")
 
 
 def presets() -> list[Listing]:
-    """Return the recipes of teachers and those of students, a column each, and their fields."""
+    """Return the presets of trainings and those of distillations, a column each, and their fields.
+
+    Those of trainings show the keys of a policy too, as simple_dp3 has them.
+    """
     from manicm_ms.training.presets import STUDENT_PRESETS, TEACHER_PRESETS
+    from manicm_ms.training.settings import flag_values
 
-    teachers = {name: TEACHER_PRESETS.get(name) for name in TEACHER_PRESETS.names()}
-    students = {name: STUDENT_PRESETS.get(name) for name in STUDENT_PRESETS.names()}
-    return [_recipes("teacher presets", teachers), _recipes("student presets", students)]
+    teachers = {}
+    for name in TEACHER_PRESETS.names():
+        preset = TEACHER_PRESETS.get(name)
+        own = {f.name: getattr(preset, f.name) for f in fields(preset) if f.name != "changes"}
+        teachers[name] = own | flag_values(_SHOWN_METHOD, preset)
+    students = {}
+    for name in STUDENT_PRESETS.names():
+        distillation = STUDENT_PRESETS.get(name)
+        students[name] = {f.name: getattr(distillation, f.name) for f in fields(distillation)}
+    return [_presets(f"training presets, as for {_SHOWN_METHOD}", teachers), _presets("student presets", students)]
 
 
-def _recipes(title: str, presets: dict[str, Any]) -> Listing:
-    names = dict.fromkeys(f.name for recipe in presets.values() for f in fields(recipe))
-    rows = [(name, *(_value(name, getattr(recipe, name, None)) for recipe in presets.values())) for name in names]
+def _presets(title: str, presets: Mapping[str, Mapping[str, Any]]) -> Listing:
+    names = dict.fromkeys(name for values in presets.values() for name in values)
+    rows = [(name, *(_value(name, values.get(name)) for values in presets.values())) for name in names]
     return Listing(("field", *presets), rows, title)
 
 

@@ -23,12 +23,12 @@ from manicm_ms.demos.experts import EXPERTS
 from manicm_ms.demos.layout import OPTIONAL_FIELDS, Episode, frame_shapes
 from manicm_ms.demos.origin import collect_command, require_same_origin
 from manicm_ms.demos.store import DemoStore
+from manicm_ms.envs.env_request import EnvRequest
 from manicm_ms.errors import ConfigError, ManicmError, OutputExistsError
 from manicm_ms.paths import require_free_space
 from manicm_ms.progress import progress_bars
 from manicm_ms.provenance import package_versions
-from manicm_ms.sensing.camera_files import read_camera
-from manicm_ms.sensing.realism import Realism, resolve_realism
+from manicm_ms.sensing.realism import Realism
 from manicm_ms.spec import EnvSpec
 
 # Beyond these failures an expert is broken, not unlucky.
@@ -93,11 +93,8 @@ def collect(
     Raises StoreError where `out` holds other data or has a writer already, NoSpaceError, CameraError,
     UnknownNameError for the id, the style or the preset, ManicmError where the expert fails far too often.
     """
-    model = None if camera is None else read_camera(camera)
-    plan = CollectionPlan(
-        env_id, num_envs, seed, style, backend, colors, tuple(extras), tail_steps, resolve_realism(realism), model,
-        obs_preset,
-    )  # fmt: skip
+    env_asked = EnvRequest(env_id, backend, colors=colors, realism=realism, camera=camera, obs_preset=obs_preset)
+    plan = CollectionPlan(env_asked, num_envs, seed, style, tuple(extras), tail_steps)
     _require_some(episodes)
     out = Path(out)
     if out.is_file():
@@ -111,7 +108,7 @@ def collect(
         collector = stack.enter_context(plan.collector())
         expert, env = collector.expert, collector.env
         asked = plan.asked() | {"expert": expert.name, "style": expert.style, "backend": env.backend}
-        command = collect_command(asked, episodes, plan.extras, colors, camera)
+        command = collect_command(asked, episodes, plan.extras, plan.env)
         if store is None:
             collector.begin(seed)  # a simulator that does not run leaves no empty store behind
             provenance = asked | {"command": command, "versions": package_versions()}
@@ -142,11 +139,8 @@ def collect_episodes(
 
     Raises ConfigError, UnknownNameError, ManicmError as `collect`. An interruption loses them: for many, use `collect`.
     """
-    model = None if camera is None else read_camera(camera)
-    plan = CollectionPlan(
-        env_id, num_envs, seed, style, backend, colors, tuple(extras), tail_steps, resolve_realism(realism), model,
-        obs_preset,
-    )  # fmt: skip
+    env_asked = EnvRequest(env_id, backend, colors=colors, realism=realism, camera=camera, obs_preset=obs_preset)
+    plan = CollectionPlan(env_asked, num_envs, seed, style, tuple(extras), tail_steps)
     _require_some(episodes)
     kept: list[Episode] = []
     with plan.collector() as collector, _progress_bar(env_id, episodes, 0) as report:
@@ -225,10 +219,10 @@ def _finished(out: Path, episodes: int, plan: CollectionPlan) -> Collected | Non
     asked = plan.asked()
     with DemoStore.open(out) as store:
         if store.provenance.get("env_id") == asked["env_id"]:  # else the expert would not fit the specs
-            expert = EXPERTS.get(plan.env_id)(store.spec, 1, torch.device("cpu"), plan.style)
+            expert = EXPERTS.get(plan.env.env_id)(store.spec, 1, torch.device("cpu"), plan.style)
             asked |= {"expert": expert.name, "style": expert.style}
-        if plan.backend != "auto":
-            asked |= {"backend": plan.backend}
+        if plan.env.backend != "auto":
+            asked |= {"backend": plan.env.backend}
         require_same_origin(store, asked)
         if len(store) < episodes:
             return None

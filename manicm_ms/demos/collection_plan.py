@@ -11,12 +11,11 @@ from typing import Any
 from manicm_ms.demos.attempts import OBS_OF_FIELD, Collector
 from manicm_ms.demos.experts import EXPERTS
 from manicm_ms.demos.layout import OPTIONAL_FIELDS
-from manicm_ms.envs.simulator import ENVS, DemoRule
-from manicm_ms.envs.vec_env import make_vec
+from manicm_ms.envs.env_request import EnvRequest
+from manicm_ms.envs.simulator import DemoRule
 from manicm_ms.errors import ConfigError
 from manicm_ms.seeds import require_seed
-from manicm_ms.sensing.camera import CameraModel
-from manicm_ms.sensing.realism import Realism, realism_name
+from manicm_ms.sensing.realism import Realism, realism_name, resolve_realism
 from manicm_ms.spec import ACTION, AGENT_POS, POINT_CLOUD, STATE
 
 
@@ -27,17 +26,12 @@ class CollectionPlan:
     Raises ConfigError where a number is out of range or an extra is not known, UnknownNameError for the id.
     """
 
-    env_id: str
+    env: EnvRequest
     num_envs: int
     seed: int
     style: str | None
-    backend: str
-    colors: bool
     extras: tuple[str, ...]
     tail_steps: int | None
-    realism: Realism
-    camera: CameraModel | None
-    obs_preset: str
 
     def __post_init__(self) -> None:
         if self.num_envs < 1:
@@ -45,41 +39,43 @@ class CollectionPlan:
         require_seed(self.seed)
         if unknown := set(self.extras) - set(OPTIONAL_FIELDS):
             raise ConfigError(f"extras {sorted(unknown)} are not known: choose from {', '.join(OPTIONAL_FIELDS)}")
-        ENVS.get(self.env_id)  # knows former names too
-        EXPERTS.get(self.env_id)
+        _ = self.env.entry  # knows former names too
+        EXPERTS.get(self.env.env_id)
+
+    @property
+    def realism(self) -> Realism:
+        """What is drawn for each episode."""
+        return resolve_realism(self.env.realism)
 
     @property
     def rule(self) -> DemoRule:
         """The task's own rule, with the tail that was asked for instead of its own."""
-        own = ENVS.get(self.env_id).demos
+        own = self.env.entry.demos
         return own if self.tail_steps is None else replace(own, tail_steps=self.tail_steps)
 
     def asked(self) -> dict[str, Any]:
         """Return what is known of `origin.IDENTITY` before the environment and the expert are made."""
         return {
-            "env_id": self.env_id,
+            "env_id": self.env.env_id,
             "seed": self.seed,
             "tail_steps": self.rule.tail_steps,
             "success_steps": self.rule.success_steps,
-            "obs_preset": self.obs_preset,
+            "obs_preset": self.env.obs_preset,
             "fields": ["point_cloud", "agent_pos", ACTION, *(f for f in OPTIONAL_FIELDS if f in self.extras)],
-            "point_channels": 6 if self.colors else 3,
+            "point_channels": 6 if self.env.colors else 3,
             "realism": realism_name(self.realism),
             "realism_ranges": None if self.realism.is_clean else self.realism.to_dict(),
-            "camera": None if self.camera is None else self.camera.to_dict(),
+            "camera": None if (camera := self.env.camera_model) is None else camera.to_dict(),
         }
 
     @contextmanager
     def collector(self) -> Iterator[Collector]:
         """Make environment and expert; yield what plays, and close the environment after it."""
         keys = dict.fromkeys([POINT_CLOUD, AGENT_POS, STATE, *(OBS_OF_FIELD[f] for f in self.extras)])
-        env = make_vec(
-            self.env_id, num_envs=self.num_envs, backend=self.backend, obs=tuple(keys), colors=self.colors,
-            realism=self.realism, camera=self.camera, obs_preset=self.obs_preset,
-        )  # fmt: skip
+        env = self.env.vec_env(self.num_envs, obs=tuple(keys))
         try:
-            expert = EXPERTS.get(self.env_id)(env.env_spec, self.num_envs, env.device, self.style)
-            conditions = partial(ENVS.get(self.env_id).conditions, self.realism)
+            expert = EXPERTS.get(self.env.env_id)(env.env_spec, self.num_envs, env.device, self.style)
+            conditions = partial(self.env.entry.conditions, self.realism)
             yield Collector(env, expert, rule=self.rule, extras=self.extras, conditions=conditions)
         finally:
             env.close()

@@ -13,7 +13,7 @@ from rich.console import Console
 from rich.table import Table
 
 from manicm_ms.demos.store import DemoStore
-from manicm_ms.demos.survey import Survey, survey
+from manicm_ms.demos.summary import Summary, summarize
 from manicm_ms.errors import StoreError
 from manicm_ms.paths import write_text
 
@@ -27,11 +27,11 @@ def inspect(store: Path, html: Path | None = None, as_json: bool = False) -> int
     Args:
         store: the store.
         html: write a self-contained page to this file: summary, clouds to turn, picture strips.
-        as_json: print the fields of `Survey` as JSON instead of tables.
+        as_json: print the fields of `Summary` as JSON instead of tables.
 
     Raises StoreError where there is no store at all.
     """
-    found = survey(Path(store))
+    found = summarize(Path(store))
     console = Console(highlight=False)
     if as_json:
         print(json.dumps(found.to_dict(), indent=2, allow_nan=False))
@@ -44,8 +44,8 @@ def inspect(store: Path, html: Path | None = None, as_json: bool = False) -> int
     return 1 if found.problems else 0
 
 
-def write_page(store: Path, found: Survey, html: Path) -> None:
-    """Write the page of a surveyed store; of a damaged one it shows what can still be read."""
+def write_page(store: Path, found: Summary, html: Path) -> None:
+    """Write the page of a store that was looked through; of a damaged one it shows what can still be read."""
     import jinja2
 
     environment = jinja2.Environment(
@@ -53,7 +53,7 @@ def write_page(store: Path, found: Survey, html: Path) -> None:
     )
     episodes, strips = _readable_episodes(store, found)
     page = environment.get_template("inspect.html.j2").render(
-        survey=found, facts=_facts(found), episodes=episodes, strips=strips
+        summary=found, facts=_facts(found), episodes=episodes, strips=strips
     )
     write_text(html, page)
 
@@ -81,7 +81,7 @@ def pack_clouds(clouds: np.ndarray) -> dict[str, Any]:
     }
 
 
-def _readable_episodes(store: Path, found: Survey) -> tuple[list[dict[str, Any]], list[dict[str, str]]]:
+def _readable_episodes(store: Path, found: Summary) -> tuple[list[dict[str, Any]], list[dict[str, str]]]:
     """Return the packed episodes for the viewer, and a picture strip of each."""
     episodes: list[dict[str, Any]] = []
     strips: list[dict[str, str]] = []
@@ -94,7 +94,7 @@ def _readable_episodes(store: Path, found: Survey) -> tuple[list[dict[str, Any]]
         for k in chosen:
             try:
                 episode = reader.episode(int(k))
-            except StoreError:  # the survey has named it
+            except StoreError:  # the summary has named it
                 continue
             frames = _spread(len(episode), _MOST_FRAMES)
             clouds = np.nan_to_num(episode.point_cloud[frames], nan=0.0, posinf=0.0, neginf=0.0)
@@ -157,7 +157,7 @@ def _base64(content: bytes) -> str:
     return base64.b64encode(content).decode("ascii")
 
 
-def _facts(found: Survey) -> list[tuple[str, str]]:
+def _facts(found: Summary) -> list[tuple[str, str]]:
     """Return the summary as (name, value) rows, for the terminal and the page."""
     lengths = found.lengths
     rows = [
@@ -178,7 +178,7 @@ def _facts(found: Survey) -> list[tuple[str, str]]:
     return rows
 
 
-def _print_summary(console: Console, found: Survey) -> None:
+def _print_summary(console: Console, found: Summary) -> None:
     table = Table(title=found.path, show_header=False, title_justify="left")
     for name, value in _facts(found):
         table.add_row(name, value)

@@ -5,10 +5,10 @@ from __future__ import annotations
 import reprlib
 import shlex
 from collections.abc import Mapping
-from pathlib import Path
 from typing import Any
 
 from manicm_ms.demos.store import DemoStore
+from manicm_ms.envs.env_request import EnvRequest
 from manicm_ms.envs.simulator import ENVS
 from manicm_ms.errors import StoreError
 from manicm_ms.spec import EnvSpec
@@ -49,17 +49,12 @@ def _first_difference(name: str, theirs: Any, ours: Any) -> tuple[str, Any, Any]
     return _first_difference(f"{name}.{key}", theirs.get(key), ours.get(key))
 
 
-def collect_command(
-    asked: Mapping[str, Any], episodes: int, extras: tuple[str, ...], colors: bool, camera: Path | None
-) -> str:
+def collect_command(asked: Mapping[str, Any], episodes: int, extras: tuple[str, ...], env: EnvRequest) -> str:
     """Return the command that makes the same data (the number of environments has no part in it)."""
     words = ["manicm-ms", "collect", asked["env_id"], "--episodes", episodes, "--seed", asked["seed"]]
     words += ["--style", asked["style"], "--backend", asked["backend"]]
     tail = asked["tail_steps"]
     words += ["--tail-steps", tail] if tail != ENVS.get(asked["env_id"]).demos.tail_steps else []
-    words += ["--colors"] if colors else []
-    words += ["--obs-preset", asked["obs_preset"]] if asked["obs_preset"] != "manicm_ms" else []
-    words += ["--realism", asked["realism"]] if asked["realism"] != "clean" else []
-    words += ["--camera", camera] if camera is not None else []
+    words += env.options()
     words += ["--extras", *extras] if extras else []
     return shlex.join(str(w) for w in words)

@@ -12,8 +12,8 @@ from collections.abc import Collection, Iterable, Iterator, Mapping
 import numpy as np
 
 from manicm_ms.demos.layout import OPTIONAL_FIELDS, STORE_ARRAYS
+from manicm_ms.demos.sequence_dataset import SequenceDataset, sequence_index
 from manicm_ms.demos.store import DemoStore
-from manicm_ms.demos.windows import Windows, window_index
 from manicm_ms.demos.zarr_files import array_names, remark_missing
 from manicm_ms.spec import ChunkSpec, EnvSpec
 from manicm_ms.wording import counted
@@ -31,7 +31,7 @@ _LIMITS: Mapping[str, tuple[float, str]] = {
 """Unit -> the most that a robot's entry of this unit reaches, and the unit that it likely is in where it is more."""
 _OUTER = (0.5, 99.5)  # per cent; what lies outside is rare
 _FEWEST = 20  # frames, else one of them is no rarity
-_STRETCH = 100.0  # a normaliser whose range is this many times that of 99 % of the values wastes it
+_STRETCH = 100.0  # a normalizer whose range is this many times that of 99 % of the values wastes it
 _OUTER_POINTS = (0.05, 99.95)  # per cent of the coordinates of points, which are more, and crowd more evenly
 _STRETCH_POINTS = 5.0
 _FRAMES_LOOKED_AT = 100  # for where the bulk of the points is
@@ -94,7 +94,7 @@ def empty_clouds(clouds: np.ndarray) -> np.ndarray:
 def window_remarks(lengths: np.ndarray, chunk: ChunkSpec) -> list[str]:
     """Return the remarks about frames of episodes, (E,) control steps long, that no window of `chunk` reads."""
     remarks = []
-    windows = np.array([len(window_index(np.array([n]), chunk)) for n in lengths])
+    windows = np.array([len(sequence_index(np.array([n]), chunk)) for n in lengths])
     if unused := int((windows == 0).sum()):
         needed = chunk.horizon - (chunk.n_obs_steps - 1) - (chunk.n_action_steps - 1)
         remarks.append(
@@ -110,7 +110,7 @@ def window_remarks(lengths: np.ndarray, chunk: ChunkSpec) -> list[str]:
     return remarks
 
 
-def training_remarks(store: DemoStore, windows: Windows) -> list[str]:
+def training_remarks(store: DemoStore, windows: SequenceDataset) -> list[str]:
     """Return the remarks about a store that is learnt from: all of `store_remarks`, and what stays unused.
 
     Args:
@@ -197,7 +197,7 @@ def _stray_entries(field: str, values: np.ndarray, names: tuple[str, ...]) -> It
 def _stray(
     field: str, names: tuple[str, ...], inner: Iterable[np.ndarray], span: Iterable[np.ndarray], most: float
 ) -> Iterator[str]:
-    """Yield a line for each channel of which rare values stretch the range that a normaliser maps to [-1, 1].
+    """Yield a line for each channel of which rare values stretch the range that a normalizer maps to [-1, 1].
 
     Args:
         field: that the channels belong to.
@@ -211,7 +211,7 @@ def _stray(
             share = 100 * (high - low) / (greatest - least)
             yield (
                 f"{name} of {field} spans {least:.4g} to {greatest:.4g}, nearly all of it {low:.4g} to {high:.4g}: "
-                f"likely stray values, which leave the rest {share:.2g} % of a normaliser's range"
+                f"likely stray values, which leave the rest {share:.2g} % of a normalizer's range"
             )
 
 

@@ -1,4 +1,4 @@
-"""Ranges and moments of each channel of a demonstration store, from which a policy builds its normaliser."""
+"""Ranges and moments of each channel of a demonstration store, from which a policy builds its normalizer."""
 
 from __future__ import annotations
 

@@ -20,7 +20,7 @@ _NOISE_STREAM = 0x4D53
 
 
 class Decider(Protocol):
-    """What a rollout asks of a policy; `manicm_ms.policies.base.Policy` and `UserPolicy` give it.
+    """What a rollout asks of a policy; `manicm_ms.policies.policy.Policy` and `UserPolicy` give it.
 
     Attributes:
         spec: the environment that it was made for.

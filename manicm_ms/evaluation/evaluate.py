@@ -16,18 +16,15 @@ from manicm_ms.evaluation.policies import load_policies, require_playable, with_
 from manicm_ms.evaluation.protocol import CLEAN, OBS_PRESET, EvaluatedPolicy, Protocol
 from manicm_ms.evaluation.records import claimed_folder
 from manicm_ms.evaluation.report import write_report
-from manicm_ms.evaluation.request import command_of, request_of
+from manicm_ms.evaluation.request import command_of, identity_of
 from manicm_ms.evaluation.results import compile_results
 from manicm_ms.evaluation.video import film_pair
 from manicm_ms.machine.devices import resolve_device
 from manicm_ms.paths import write_json
 from manicm_ms.progress import working
-from manicm_ms.sensing.camera_files import read_camera
-from manicm_ms.sensing.realism import REALISM, parse_presets
+from manicm_ms.sensing.realism import parse_presets
 
 if TYPE_CHECKING:
-    from manicm_ms.envs.simulator import EnvEntry
-    from manicm_ms.sensing.camera import CameraModel
     from manicm_ms.spec import EnvSpec
 
 
@@ -85,32 +82,21 @@ def evaluate(
     Returns what results.json holds. Raises ManicmError: a name, a checkpoint or a folder that does not fit, no space.
     """
     from manicm_ms.envs.backends import resolve_backend
+    from manicm_ms.envs.env_request import EnvRequest
     from manicm_ms.envs.simulator import ENVS, SimulatorConfig
 
-    entry, seeds, presets = ENVS.get(env_id), tuple(range(seed, seed + episodes)), parse_presets(realism)
-    rows = _rows(num_envs, episodes)
+    entry, seeds = ENVS.get(env_id), tuple(range(seed, seed + episodes))
+    presets, rows = parse_presets(realism), _rows(num_envs, episodes)
+    where = resolve_backend(backend, entry)
+    env = EnvRequest(env_id, where, colors=colors, realism=realism, camera=camera, obs_preset=obs_preset)
+    env.require_offered()
     protocol = Protocol(env_id, seeds, rows, threads, repetitions, videos, presets, to_the_end, entry.seed_limit)
-    backend = resolve_backend(backend, entry)
-    model = _camera(entry, camera, presets, obs_preset)
     device = str(resolve_device(device))
     offered = SimulatorConfig(obs_preset=obs_preset, colors=colors).specialise(entry.spec)
     evaluated = _policies(checkpoints, policies, device, control, offered, () if allow_seen_seeds else seeds)
-    request = request_of(protocol, evaluated, backend, device, model, obs_preset)
-    command = command or command_of(
-        checkpoints, policies, env_id, episodes, seed, out, realism, camera, obs_preset, allow_seen_seeds, to_the_end
-    )
-    makers = env_maker(env_id, backend, model, obs_preset)
-    return evaluate_policies(evaluated, protocol, makers, out, request, command, console or Console())
-
-
-def _camera(entry: EnvEntry, file: Path | None, presets: Sequence[str], obs_preset: str) -> CameraModel | None:
-    """Return the camera of a file; raise ConfigError where the environment lacks it, a preset or the observations."""
-    from manicm_ms.envs.simulator import SimulatorConfig
-
-    camera = None if file is None else read_camera(file)
-    for preset in presets:
-        entry.require(SimulatorConfig(realism=REALISM.get(preset), camera=camera, obs_preset=obs_preset))
-    return camera
+    identity = identity_of(protocol, evaluated, env, device)
+    command = command or command_of(checkpoints, policies, env, episodes, seed, out, allow_seen_seeds, to_the_end)
+    return evaluate_policies(evaluated, protocol, env_maker(env), out, identity, command, console or Console())
 
 
 def _policies(

@@ -15,7 +15,7 @@ from manicm_ms.errors import ConfigError, OutputExistsError
 from manicm_ms.evaluation.decisions import Decider
 from manicm_ms.machine.devices import torch_threads
 from manicm_ms.paths import write_json
-from manicm_ms.spec import AGENT_POS, POINT_CLOUD, ChunkSpec, EnvSpec
+from manicm_ms.policies.policy import example_observations
 
 
 class Latency(NamedTuple):
@@ -38,19 +38,6 @@ class Latency(NamedTuple):
     threads: int
     dtype: str
     device: str
-
-
-def example_observation(spec: EnvSpec, chunk: ChunkSpec, seed: int = 0) -> dict[str, torch.Tensor]:
-    """Return one observation of the right shapes on the CPU: point_cloud (1, To, P, C), agent_pos (1, To, D).
-
-    Values are uniform in [0, 1): a decision takes the same operations whatever they are.
-    """
-    generator = torch.Generator().manual_seed(seed)
-    frames = (1, chunk.n_obs_steps)
-    return {
-        POINT_CLOUD: torch.rand((*frames, spec.obs.num_points, spec.obs.point_channels), generator=generator),
-        AGENT_POS: torch.rand((*frames, spec.obs.agent_pos_dim), generator=generator),
-    }
 
 
 def measure_latency(
@@ -82,7 +69,7 @@ def measure_latency(
         raise ConfigError(
             f"repetitions={repetitions} and threads={threads} must be at least 1, warmup={warmup} at least 0"
         )
-    observations = {name: example_observation(p.spec, p.chunk, seed) for name, p in policies.items()}
+    observations = {name: example_observations(p, seed=seed) for name, p in policies.items()}
     times: dict[str, list[float]] = {name: [] for name in policies}
     for policy in policies.values():
         policy.eval()

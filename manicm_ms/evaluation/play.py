@@ -9,19 +9,19 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 from rich.console import Console
 from rich.progress import Progress
 
-from manicm_ms.evaluation.protocol import CLEAN, OBS_PRESET, Conditions, EvaluatedPolicy, Protocol, slug
+from manicm_ms.evaluation.protocol import CLEAN, Conditions, EvaluatedPolicy, Protocol, slug
 from manicm_ms.evaluation.records import EpisodeLog
 from manicm_ms.evaluation.rollout import EpisodeResult, RestartableEnv, rollout
 from manicm_ms.machine.devices import torch_threads
 from manicm_ms.progress import progress_bars
-from manicm_ms.sensing.camera import CameraModel
 from manicm_ms.sensing.realism import REALISM, RealismSample
 from manicm_ms.spec import AGENT_POS, ChunkSpec, EnvSpec, require_compatible
 
 if TYPE_CHECKING:
+    from manicm_ms.envs.env_request import EnvRequest
     from manicm_ms.envs.vector import VecEnv
     from manicm_ms.evaluation.user_policy import UserPolicy
-    from manicm_ms.policies.base import Policy
+    from manicm_ms.policies.policy import Policy
 
 
 class EnvMaker(NamedTuple):
@@ -38,25 +38,21 @@ class EnvMaker(NamedTuple):
     conditions: Conditions = lambda preset, seed: {}
 
 
-def env_maker(env_id: str, backend: str, camera: CameraModel | None = None, obs_preset: str = OBS_PRESET) -> EnvMaker:
-    """Return what makes the real environments of `env_id`; see `evaluate` for the arguments."""
-    from manicm_ms.envs.simulator import ENVS
-    from manicm_ms.envs.vec_env import make_vec
+def env_maker(request: EnvRequest) -> EnvMaker:
+    """Return what makes the real environments that are asked for."""
 
     def for_policy(policy: Policy | UserPolicy, n: int, preset: str) -> VecEnv:
         obs = policy.spec.obs
-        return make_vec(
-            env_id, n, backend, chunk=policy.chunk, num_points=obs.num_points, colors=obs.point_channels == 6,
-            realism=preset, camera=camera, obs_preset=obs_preset,
+        return request.vec_env(
+            n, realism=preset, obs=policy.keys, chunk=policy.chunk, num_points=obs.num_points,
+            colors=obs.point_channels == 6,
         )  # fmt: skip
 
     def for_film(n: int, preset: str) -> VecEnv:
-        return make_vec(
-            env_id, n, backend, obs=(AGENT_POS,), video=True, realism=preset, camera=camera, obs_preset=obs_preset
-        )
+        return request.vec_env(n, realism=preset, obs=(AGENT_POS,), colors=False, video=True)
 
     def conditions(preset: str, seed: int) -> RealismSample:
-        return ENVS.get(env_id).conditions(REALISM.get(preset), seed)
+        return request.entry.conditions(REALISM.get(preset), seed)
 
     return EnvMaker(for_policy, for_film, conditions)
 
@@ -145,13 +141,13 @@ class _KeptEnv:
     def __init__(self, envs: EnvMaker, protocol: Protocol, preset: str) -> None:
         self._envs, self._protocol, self.preset = envs, protocol, preset
         self._env: RestartableEnv | None = None
-        self._shape: tuple[int, ...] = ()
+        self._shape: tuple[Any, ...] = ()
         self.spec: EnvSpec | None = None
 
     def env_for(self, evaluated: EvaluatedPolicy) -> RestartableEnv:
         """Return an env that plays the policy's chunks, the one at hand where it does."""
         policy = evaluated.policy
-        shape = _exchange(policy.chunk, policy.spec)
+        shape = (*_exchange(policy.chunk, policy.spec), policy.keys)
         if self._env is None or shape != self._shape:
             self._close()
             rows = self._protocol.num_envs

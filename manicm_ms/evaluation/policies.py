@@ -15,7 +15,7 @@ from manicm_ms.paths import sha256
 from manicm_ms.spec import DP3_FRAME, EnvSpec, require_compatible
 
 if TYPE_CHECKING:
-    from manicm_ms.policies.base import Policy
+    from manicm_ms.policies.action_policy import ActionPolicy
 
 
 def load_policies(checkpoints: Sequence[Path], device: str = "cpu", control: bool = True) -> list[EvaluatedPolicy]:
@@ -24,7 +24,6 @@ def load_policies(checkpoints: Sequence[Path], device: str = "cpu", control: boo
     Names are the folders' names, with their parents' where two are alike.
     """
     from manicm_ms.policies.checkpoint import load_checkpoint, read_manifest
-    from manicm_ms.policies.diffusion import DiffusionPolicy, OneStepTeacher
 
     paths = [Path(p) for p in checkpoints]
     names = [p.resolve().name for p in paths]
@@ -33,14 +32,14 @@ def load_policies(checkpoints: Sequence[Path], device: str = "cpu", control: boo
     if len(set(names)) < len(names):
         raise ConfigError(f"two checkpoints have one name ({', '.join(names)}): name different ones")
     policies = []
-    for name, path in zip(names, paths, strict=True):
-        policy = load_checkpoint(path, device=device)
+    loaded = [load_checkpoint(path, device=device) for path in paths]
+    for name, path, policy in zip(names, paths, loaded, strict=True):
         origin = Origin.read(policy.spec.env_id, read_manifest(path)["provenance"])
         role, digest = role_of(policy), checkpoint_digest(str(path))
         policies.append(EvaluatedPolicy(name, role, str(path), policy, origin, digest))
-    if control and policies and isinstance(teacher := policies[0].policy, DiffusionPolicy):
+    if control and loaded and (once := loaded[0].one_step()) is not None:
         named = f"{policies[0].name}, one step"
-        policies.insert(1, replace(policies[0], name=named, role=CONTROL, policy=OneStepTeacher(teacher)))
+        policies.insert(1, replace(policies[0], name=named, role=CONTROL, policy=once))
     return policies
 
 
@@ -78,12 +77,9 @@ def _free_name(name: str, taken: Collection[str]) -> str:
     return name if name not in taken else next(n for n in numbered if n not in taken)
 
 
-def role_of(policy: Policy) -> str:
-    """Return the role of a checkpoint's policy, by the tag that it is registered with."""
-    from manicm_ms.policies.base import POLICIES
-
-    tags = POLICIES.tags(policy.name)
-    return next((role for role in (TEACHER, STUDENT) if role in tags), OTHER)
+def role_of(policy: ActionPolicy) -> str:
+    """Return the role of a checkpoint's policy: what its head is in a distillation."""
+    return policy.role if policy.role in (TEACHER, STUDENT) else OTHER
 
 
 def require_playable(policies: Sequence[EvaluatedPolicy], offered: EnvSpec, held_out: Sequence[int]) -> None:

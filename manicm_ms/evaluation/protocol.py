@@ -14,7 +14,7 @@ from manicm_ms.sensing.realism import RealismSample
 
 if TYPE_CHECKING:
     from manicm_ms.evaluation.user_policy import UserPolicy
-    from manicm_ms.policies.base import Policy
+    from manicm_ms.policies.policy import Policy
 
 TEACHER, CONTROL, STUDENT, OTHER = "teacher", "control", "student", "policy"
 """Roles: a diffusion policy, the same in one step without distillation, a distilled policy, any other."""

@@ -5,40 +5,29 @@ from __future__ import annotations
 import shlex
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
-from manicm_ms.evaluation.protocol import (
-    CLEAN,
-    CONTROL,
-    OBS_PRESET,
-    OTHER,
-    STUDENT,
-    TEACHER,
-    EvaluatedPolicy,
-    Protocol,
-)
+from manicm_ms.evaluation.protocol import CLEAN, CONTROL, OBS_PRESET, OTHER, STUDENT, TEACHER, EvaluatedPolicy, Protocol
 from manicm_ms.sensing.camera import CameraModel
 from manicm_ms.sensing.realism import REALISM
 
+if TYPE_CHECKING:
+    from manicm_ms.envs.env_request import EnvRequest
 
-def request_of(
-    protocol: Protocol,
-    policies: Sequence[EvaluatedPolicy],
-    backend: str,
-    device: str,
-    camera: CameraModel | None,
-    obs_preset: str,
+
+def identity_of(
+    protocol: Protocol, policies: Sequence[EvaluatedPolicy], env: EnvRequest, device: str
 ) -> dict[str, Any]:
     """Return what identifies an evaluation in its folder: an interrupted one goes on where all of it is the same."""
     return {
         "env_id": protocol.env_id,
         "seed": protocol.seeds[0],
         "episodes": len(protocol.seeds),
-        "backend": backend,
+        "backend": env.backend,
         "device": device,
         "policies": [[c.name, _place(i, c), c.digest] for i, c in enumerate(policies)],
-        **_requested_realism(protocol.realism, camera),
-        **({} if obs_preset == OBS_PRESET else {"obs_preset": obs_preset}),
+        **_requested_realism(protocol.realism, env.camera_model),
+        **({} if env.obs_preset == OBS_PRESET else {"obs_preset": env.obs_preset}),
     }
 
 
@@ -60,21 +49,16 @@ def _requested_realism(presets: tuple[str, ...], camera: CameraModel | None) -> 
 def command_of(
     checkpoints: Sequence[Path],
     policies: Sequence[str],
-    env_id: str,
+    env: EnvRequest,
     episodes: int,
     seed: int,
     out: Path,
-    realism: str,
-    camera: Path | None,
-    obs_preset: str,
     allow_seen_seeds: bool,
     to_the_end: bool,
 ) -> str:
     """Return the command line of `evaluate` with these arguments; those left at their default are left out."""
     flags = (["--allow-seen-seeds"] if allow_seen_seeds else []) + ([] if to_the_end else ["--no-to-the-end"])
-    words = ["manicm-ms", "evaluate", *map(str, checkpoints), "--env", env_id]
+    words = ["manicm-ms", "evaluate", *map(str, checkpoints), "--env", env.env_id]
     words += [word for source in policies for word in ("--policy", source)]
-    words += ["--obs-preset", obs_preset] if obs_preset != OBS_PRESET else []
-    words += ["--realism", realism] if realism != CLEAN else []
-    words += ["--camera", str(camera)] if camera is not None else []
-    return shlex.join([*words, "--episodes", str(episodes), "--seed", str(seed), "--out", str(out), *flags])
+    words += ["--episodes", str(episodes), "--seed", str(seed), "--out", str(out)]
+    return shlex.join([*words, *env.options(), *flags])

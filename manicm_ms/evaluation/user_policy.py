@@ -14,9 +14,9 @@ from torch import Tensor
 
 from manicm_ms.errors import ManicmError, UserPolicyError
 from manicm_ms.evaluation.decisions import State
-from manicm_ms.evaluation.latency import example_observation
+from manicm_ms.policies.policy import example_observations
 from manicm_ms.registry import where_it_failed
-from manicm_ms.spec import ChunkSpec, EnvSpec
+from manicm_ms.spec import AGENT_POS, POINT_CLOUD, ChunkSpec, EnvSpec
 
 FORM = "FILE.py:FUNCTION"
 _TRIAL_ROWS = 2
@@ -36,6 +36,7 @@ class UserPolicy:
     """
 
     noise_draws = 1
+    keys = (POINT_CLOUD, AGENT_POS)
 
     def __init__(self, source: str, made: Any, spec: EnvSpec) -> None:
         self.source, self.spec, self._made = source, spec, made
@@ -119,8 +120,7 @@ def load_user_policy(source: str, spec: EnvSpec) -> UserPolicy:
         UserPolicyError: the file or function does not exist or fails, or the policy's first actions are unfit.
     """
     policy = UserPolicy(source, _call(source, _factory(source), spec), spec)
-    one = example_observation(spec, policy.chunk)
-    obs = {key: value.repeat(_TRIAL_ROWS, *[1] * (value.dim() - 1)).to(policy.device) for key, value in one.items()}
+    obs = {key: value.to(policy.device) for key, value in example_observations(policy, _TRIAL_ROWS).items()}
     noise = torch.zeros(1, _TRIAL_ROWS, policy.chunk.horizon, spec.action.dim, device=policy.device)
     try:
         policy.eval()

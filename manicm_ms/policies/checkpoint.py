@@ -4,7 +4,7 @@
 
     runs/teacher/
       config.json          policy, its configuration, the environment's spec, To, Tp, Ta
-      model.safetensors    weights and normaliser
+      model.safetensors    weights and normalizer
       MODEL_CARD.md        what it is, what it was trained on, licence
       manifest.json        format, SHA-256 of the other files, versions, provenance
 
@@ -27,13 +27,16 @@ from torch import Tensor, nn
 
 from manicm_ms.errors import CheckpointError, ConfigError, ManicmError, NoSpaceError, OutputExistsError
 from manicm_ms.paths import is_disk_full, replaced_folder, require_free_space, set_aside, sha256, write_json, write_text
-from manicm_ms.policies.base import POLICIES, Policy
+from manicm_ms.policies.action_policy import ActionPolicy, build_policy
+from manicm_ms.policies.heads.head import HEADS
+from manicm_ms.policies.migration import present_config, present_tensors
 from manicm_ms.policies.model_card import model_card
 from manicm_ms.provenance import package_versions
 from manicm_ms.spec import ChunkSpec, EnvSpec
 
 FORMAT = "manicm_ms.checkpoint"
-FORMAT_VERSION = 1
+FORMAT_VERSION = 2
+READABLE_VERSIONS = (1, 2)
 WEIGHTS_DTYPES = {"float32": torch.float32, "bfloat16": torch.bfloat16, "float16": torch.float16}
 
 _CONFIG, _MODEL, _CARD, _MANIFEST = "config.json", "model.safetensors", "MODEL_CARD.md", "manifest.json"
@@ -41,7 +44,9 @@ _FILES = (_CONFIG, _MODEL, _CARD)
 _COMPILED = "_orig_mod"  # name under which `torch.compile` holds the module that it wraps
 
 
-def save_checkpoint(policy: Policy, folder: Path, provenance: Mapping[str, Any], *, dtype: str = "float32") -> None:
+def save_checkpoint(
+    policy: ActionPolicy, folder: Path, provenance: Mapping[str, Any], *, dtype: str = "float32"
+) -> None:
     """Write `policy` to `folder`, in place of the checkpoint there, if any; a kill leaves the old or the new one.
 
     Args:
@@ -50,7 +55,7 @@ def save_checkpoint(policy: Policy, folder: Path, provenance: Mapping[str, Any],
         provenance: where it comes from, JSON values: data, preset, steps, seed, command, ...
         dtype: of the stored weights, a name in `WEIGHTS_DTYPES`; they are float32 again when loaded. float16
             halves the file and keeps 11 significant bits. Only floating parameters are cast: buffers, such as the
-            normaliser's, keep their values.
+            normalizer's, keep their values.
 
     Raises:
         CheckpointError: the policy is a wrapper that no checkpoint can hold, or its weights are not finite.
@@ -59,8 +64,8 @@ def save_checkpoint(policy: Policy, folder: Path, provenance: Mapping[str, Any],
         NoSpaceError: the disk is full; the old checkpoint stays.
     """
     folder, policy = Path(folder), _unwrapped(policy)
-    if not policy.registered:
-        raise CheckpointError(f"{policy.name} is a wrapper around another policy: save that one")
+    if HEADS.name_of(type(policy.head)) is None:
+        raise CheckpointError(f"{policy.name} shares the weights of another policy: save that one")
     if dtype not in WEIGHTS_DTYPES:
         raise ConfigError(f"unknown checkpoint dtype {dtype!r}: use {', '.join(WEIGHTS_DTYPES)}")
     if folder.exists() and (not folder.is_dir() or (any(folder.iterdir()) and not _is_checkpoint(folder))):
@@ -106,9 +111,10 @@ def read_manifest(folder: Path) -> dict[str, Any]:
     if manifest.get("format") != FORMAT:
         raise CheckpointError(f"{path} is of format {manifest.get('format')!r}, not {FORMAT!r}: it is foreign")
     version = manifest.get("version")
-    if version != FORMAT_VERSION:
+    if version not in READABLE_VERSIONS:
         raise CheckpointError(
-            f"{path} has format version {version!r} and this package reads {FORMAT_VERSION}: "
+            f"{path} has format version {version!r} and this package reads "
+            f"{' and '.join(map(str, READABLE_VERSIONS))}: "
             "install the version of manicm_ms that wrote it"
         )
     if not isinstance(manifest.get("files"), dict) or set(manifest["files"]) != set(_FILES):
@@ -134,20 +140,22 @@ def verify_checkpoint(folder: Path) -> dict[str, Any]:
     return manifest
 
 
-def load_checkpoint(folder: Path, device: torch.device | str = "cpu") -> Policy:
+def load_checkpoint(folder: Path, device: torch.device | str = "cpu") -> ActionPolicy:
     """Return the policy of a checkpoint, float32, ready to act on `device`.
 
     Raises:
         CheckpointError: the checkpoint is missing, incomplete, altered or foreign; the message names the file.
     """
     folder = Path(folder)
-    verify_checkpoint(folder)
-    policy = _build(folder / _CONFIG)
+    version = verify_checkpoint(folder)["version"]
+    policy = _build(folder / _CONFIG, version)
     path = folder / _MODEL
     try:
         tensors = load_file(path)
     except (SafetensorError, OSError) as error:
         raise CheckpointError(f"{path} cannot be read ({error}): copy or train the checkpoint again") from error
+    if version == 1:
+        tensors = present_tensors(tensors)
     expected = policy.state_dict()
     wrong = sorted(expected.keys() ^ tensors.keys())
     wrong += sorted(k for k in expected.keys() & tensors.keys() if expected[k].shape != tensors[k].shape)
@@ -160,16 +168,16 @@ def load_checkpoint(folder: Path, device: torch.device | str = "cpu") -> Policy:
     return policy.to(device).eval()
 
 
-def _unwrapped(policy: nn.Module) -> Policy:
+def _unwrapped(policy: nn.Module) -> ActionPolicy:
     """Return the policy that `torch.compile` wrapped, or the policy itself."""
     policy = getattr(policy, "_modules", {}).get(_COMPILED, policy)
-    if not isinstance(policy, Policy):
+    if not isinstance(policy, ActionPolicy):
         raise CheckpointError(f"a {type(policy).__name__} is no policy of this package: save the policy that it wraps")
     return policy
 
 
-def _stored(policy: Policy, dtype: torch.dtype) -> dict[str, Tensor]:
-    """Return name -> tensor on the CPU, under the names of the policy as `POLICIES` builds it."""
+def _stored(policy: ActionPolicy, dtype: torch.dtype) -> dict[str, Tensor]:
+    """Return name -> tensor on the CPU, under the names of the policy as `build_policy` makes it."""
     parameters = {key for key, _ in policy.named_parameters(remove_duplicate=False)}
     tensors = {}
     for key, value in policy.state_dict().items():
@@ -201,11 +209,13 @@ def _manifest(folder: Path, policy: str, dtype: str, provenance: Mapping[str, An
     }
 
 
-def _build(path: Path) -> Policy:
+def _build(path: Path, version: int) -> ActionPolicy:
     description = _read_json(path)
     try:
-        spec = EnvSpec.from_dict(description["env_spec"])
-        return POLICIES.get(description["policy"])(description["config"], spec, ChunkSpec(**description["chunk"]))
+        spec, config = EnvSpec.from_dict(description["env_spec"]), description["config"]
+        if version == 1:
+            config = present_config(config)
+        return build_policy(description["policy"], config, spec, ChunkSpec(**description["chunk"]))
     except ManicmError as error:
         raise CheckpointError(f"{path} describes no policy that this version can build: {error}") from error
     except (KeyError, TypeError, ValueError, AttributeError) as error:

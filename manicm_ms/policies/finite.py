@@ -23,21 +23,26 @@ def finite_obs(obs: Mapping[str, Tensor], spec: EnvSpec) -> Mapping[str, Tensor]
     0006). A state that holds such a number has no substitute.
 
     Args:
-        obs: `point_cloud` (B, To, P, C) and `agent_pos` (B, To, D).
+        obs: what a policy reads, each key as (B, To, ...).
         spec: the environment that they are of.
 
     Returns:
-        `obs` itself where all is finite, which costs two sums and one wait for an accelerator; while a CUDA graph is
-        recorded nothing is looked at.
+        `obs` itself where all is finite, which costs a sum for each key and one wait for an accelerator; while a CUDA
+        graph is recorded nothing is looked at.
 
     Raises:
-        NotFiniteError: `agent_pos` holds NaN or infinity, or a frame has no finite point; it names the rows.
+        NotFiniteError: a cloud's frame has no finite point, or another key holds NaN or infinity; it names the rows.
     """
-    cloud, state = obs[POINT_CLOUD], obs[AGENT_POS]
-    if _recorded(cloud) or _finite_sum(cloud, state):
+    values = list(obs.values())
+    if _recorded(values[0]) or _finite_sum(*values):
         return obs
-    _require_finite_state(state, spec)
-    return {**obs, POINT_CLOUD: _without_bad_points(cloud)}
+    found = dict(obs)
+    for key, value in obs.items():
+        if key == POINT_CLOUD:
+            found[key] = _without_bad_points(value)
+        else:
+            _require_finite(key, value, spec)
+    return found
 
 
 def require_finite_actions(actions: Tensor, name: str) -> None:
@@ -64,15 +69,18 @@ def _finite_sum(values: Tensor, *others: Tensor) -> bool:
     return math.isfinite(total.item())
 
 
-def _require_finite_state(state: Tensor, spec: EnvSpec) -> None:
-    bad = ~torch.isfinite(state)  # (B, To, D)
+def _require_finite(key: str, value: Tensor, spec: EnvSpec) -> None:
+    bad = ~torch.isfinite(value)  # (B, To, ...)
     if not bad.any():
         return
-    names = [spec.agent_pos_names[i] for i in bad.flatten(0, 1).any(0).nonzero().flatten().tolist()]
+    where, remedy = "", "look at what makes it"
+    if key == AGENT_POS:
+        names = [spec.agent_pos_names[i] for i in bad.flatten(0, 1).any(0).nonzero().flatten().tolist()]
+        where, remedy = f" ({_listed(names)})", "read the robot's state again, or stop"
     rows = _rows(bad)
     raise NotFiniteError(
-        f"agent_pos holds {int(bad.sum())} values of NaN or infinity in {_shown('row', rows)} "
-        f"({_listed(names)}): no action can be chosen from it; read the robot's state again, or stop",
+        f"{key} holds {int(bad.sum())} values of NaN or infinity in {_shown('row', rows)}{where}: "
+        f"no action can be chosen from it; {remedy}",
         rows,
     )
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any
 
-from manicm_ms.policies.base import POLICIES, Policy
+from manicm_ms.policies.action_policy import ActionPolicy
 
 LICENSE = "MIT"
 _LONG_LIST = 12  # numbers; longer lists are shown by their range
@@ -13,7 +13,7 @@ _LONG_LIST = 12  # numbers; longer lists are shown by their range
 _TITLES = {"teacher": "diffusion teacher", "student": "consistency student"}
 
 
-def model_card(policy: Policy, provenance: Mapping[str, Any], dtype: str) -> str:
+def model_card(policy: ActionPolicy, provenance: Mapping[str, Any], dtype: str) -> str:
     """Return the Markdown text that stands beside the weights of `policy`.
 
     Args:
@@ -22,7 +22,7 @@ def model_card(policy: Policy, provenance: Mapping[str, Any], dtype: str) -> str
         dtype: of the stored weights.
     """
     spec, chunk = policy.spec, policy.chunk
-    role = next((_TITLES[t] for t in _TITLES if t in POLICIES.tags(policy.name)), "policy")
+    role = _TITLES.get(policy.role or "", "policy")
     parameters = sum(p.numel() for p in policy.parameters())
     channels = {3: "x, y, z", 6: "x, y, z, r, g, b"}[spec.obs.point_channels]
     lines = [

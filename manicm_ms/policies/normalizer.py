@@ -11,7 +11,7 @@ from torch import Tensor, nn
 from manicm_ms.errors import ConfigError, SpecMismatchError
 
 if TYPE_CHECKING:
-    from manicm_ms.policies.base import ChannelStats
+    from manicm_ms.policies.policy import ChannelStats
 
 MIN_RANGE = 1e-4
 """A channel whose max - min is below this (in its own unit) counts as constant, as in DP3."""
@@ -77,7 +77,7 @@ class Normalizer(nn.Module):
 
     def _affine(self, field: str) -> tuple[Tensor, Tensor]:
         if field not in self.fields:
-            raise ConfigError(f"the normaliser has no field {field!r}: known: {', '.join(self.fields)}")
+            raise ConfigError(f"the normalizer has no field {field!r}: known: {', '.join(self.fields)}")
         return getattr(self, f"{field}_scale"), getattr(self, f"{field}_offset")
 
 

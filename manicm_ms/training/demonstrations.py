@@ -9,9 +9,9 @@ from pathlib import Path
 from typing import Any
 
 from manicm_ms.demos.remarks import training_remarks
+from manicm_ms.demos.sequence_dataset import SequenceDataset
 from manicm_ms.demos.stats import FieldStats, field_stats, store_stats
 from manicm_ms.demos.store import DemoStore
-from manicm_ms.demos.windows import Windows
 from manicm_ms.errors import ConfigError, SpecMismatchError
 from manicm_ms.spec import ACTION, AGENT_POS, POINT_CLOUD, ChunkSpec, EnvSpec, require_compatible
 
@@ -25,7 +25,7 @@ class Demos:
 
     Attributes:
         spec: of the environment that they come from.
-        windows: all of them, on the CPU.
+        dataset: their windows, on the CPU.
         stats: ranges of `point_cloud`, `agent_pos` and `action`.
         provenance: path, content hash, sizes, `demo_seeds` (the seed of each episode, so that an evaluation can
             tell what was seen), and the store's own provenance, JSON values; of several stores `stores` holds theirs.
@@ -33,7 +33,7 @@ class Demos:
     """
 
     spec: EnvSpec
-    windows: Windows
+    dataset: SequenceDataset
     stats: Mapping[str, FieldStats]
     provenance: dict[str, Any]
     remarks: tuple[str, ...] = ()
@@ -69,30 +69,30 @@ def read_demos(data: Data, chunk: ChunkSpec) -> Demos:
 def _read(path: Path, chunk: ChunkSpec) -> Demos:
     with DemoStore.open(path) as store:
         stats = store_stats(store)
-        windows = Windows.from_store(store, chunk)
+        dataset = SequenceDataset.from_store(store, chunk)
         digest = hashlib.sha256()
-        for tensor in (windows.point_cloud, windows.agent_pos, windows.action, windows.index):
+        for tensor in (dataset.point_cloud, dataset.agent_pos, dataset.action, dataset.index):
             digest.update(tensor.numpy().tobytes())
         provenance = {
             "path": str(path),
             "env_id": store.spec.env_id,
             "episodes": len(store),
-            "frames": len(windows.action),
-            "windows": len(windows),
+            "frames": len(dataset.action),
+            "windows": len(dataset),
             "sha256": digest.hexdigest(),
             "demo_seeds": store.seeds.tolist(),
             "collection": store.provenance,
         }
-        remarks = tuple(f"{path}: {remark}" for remark in training_remarks(store, windows))
-        return Demos(store.spec, windows, stats, provenance, remarks)
+        remarks = tuple(f"{path}: {remark}" for remark in training_remarks(store, dataset))
+        return Demos(store.spec, dataset, stats, provenance, remarks)
 
 
 def _joined(parts: Sequence[Demos]) -> Demos:
     first = parts[0]
     for part in parts[1:]:
         _require_same_task(first, part)
-    windows = Windows.joined([part.windows for part in parts])
-    arrays = {POINT_CLOUD: windows.point_cloud, AGENT_POS: windows.agent_pos, ACTION: windows.action}
+    dataset = SequenceDataset.joined([part.dataset for part in parts])
+    arrays = {POINT_CLOUD: dataset.point_cloud, AGENT_POS: dataset.agent_pos, ACTION: dataset.action}
     stores = [part.provenance for part in parts]
     provenance = {
         "path": " ".join(store["path"] for store in stores),
@@ -103,7 +103,7 @@ def _joined(parts: Sequence[Demos]) -> Demos:
         "stores": stores,
     }
     stats = {name: field_stats(array.numpy(), name) for name, array in arrays.items()}
-    return Demos(first.spec, windows, stats, provenance, tuple(remark for part in parts for remark in part.remarks))
+    return Demos(first.spec, dataset, stats, provenance, tuple(remark for part in parts for remark in part.remarks))
 
 
 def _require_same_task(first: Demos, other: Demos) -> None:

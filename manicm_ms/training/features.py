@@ -1,4 +1,4 @@
-"""Windows seen through a frozen encoder: features are computed once, so that distillation runs only the U-Net."""
+"""Demonstrations seen through a frozen encoder: computed once, so that distillation runs the backbone alone."""
 
 from __future__ import annotations
 
@@ -8,14 +8,12 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from manicm_ms.demos.windows import Windows
-from manicm_ms.policies.denoiser import ConditionedDenoiser
-from manicm_ms.policies.points import POINT_CHOICES
-from manicm_ms.spec import ACTION, POINT_CLOUD
+from manicm_ms.demos.sequence_dataset import SequenceDataset
+from manicm_ms.policies.action_policy import ActionPolicy
+from manicm_ms.policies.encoders.encoder import Features
+from manicm_ms.spec import ACTION
 from manicm_ms.training.stream import subset_generator
 
-COND = "cond"
-"""(B, K, F) features of K point subsets of each window's observation."""
 CLEAN_ACTION = "x0"
 """(B, Tp, Da) normalised actions."""
 
@@ -23,15 +21,15 @@ _BATCH = 128  # windows encoded at a time
 
 
 @dataclass(frozen=True)
-class FeatureWindows:
-    """Features and actions of all windows of a demonstration store.
+class FeatureDataset:
+    """Features and actions of all windows of demonstrations.
 
     Attributes:
-        cond: (N, K, F) float32, features of K point subsets of each window.
+        features: field of `Features` -> (N, K, ...) float32, those of K draws of each window's observation.
         x0: (N, Tp, Da) float32, normalised actions.
     """
 
-    cond: Tensor
+    features: Mapping[str, Tensor]
     x0: Tensor
 
     def __len__(self) -> int:
@@ -39,49 +37,50 @@ class FeatureWindows:
         return len(self.x0)
 
     def batch(self, indices: Tensor) -> dict[str, Tensor]:
-        """Return the windows with these (B,) indices: `COND` (B, K, F) and `CLEAN_ACTION` (B, Tp, Da)."""
+        """Return the windows with these (B,) indices: each field as (B, K, ...) and `CLEAN_ACTION` (B, Tp, Da)."""
         indices = indices.to(self.x0.device)
-        return {COND: self.cond[indices], CLEAN_ACTION: self.x0[indices]}
+        return {name: values[indices] for name, values in self.features.items()} | {CLEAN_ACTION: self.x0[indices]}
 
 
-def draw_points(
-    batch: Mapping[str, Tensor], points: int | None, generator: torch.Generator, choice: str = "random"
-) -> dict[str, Tensor]:
-    """Return the batch with `points` of its points, the same places in each cloud.
-
-    Args:
-        batch: `point_cloud` (B, To, P, C) and others, which stay.
-        points: how many; None, or as many as there are, leaves the clouds as they are.
-        generator: on the device of the batch.
-        choice: a name in `POINT_CHOICES`.
-    """
-    cloud = batch[POINT_CLOUD]
-    if points is None or points >= cloud.shape[2]:
-        return dict(batch)
-    return {**batch, POINT_CLOUD: POINT_CHOICES.get(choice).training(cloud, points, generator)}
+def chosen_features(batch: Mapping[str, Tensor], generator: torch.Generator) -> Features:
+    """Return one of the K draws of each row of a batch of `FeatureDataset`; `generator` chooses."""
+    rows, draws = batch["cond"].shape[:2]
+    device = batch["cond"].device
+    draw = torch.randint(draws, (rows,), generator=generator, device=device)
+    row = torch.arange(rows, device=device)
+    return Features(**{name: batch[name][row, draw] for name in Features._fields if name in batch})
 
 
 @torch.no_grad()
-def encode_windows(network: ConditionedDenoiser, windows: Windows, draws: int, seed: int) -> FeatureWindows:
+def encode_dataset(policy: ActionPolicy, dataset: SequenceDataset, draws: int, seed: int) -> FeatureDataset:
     """Encode every window in float32, as a policy does when it acts.
 
     Args:
-        network: its encoder is frozen, its normaliser fitted; on the device of `windows`.
-        windows: of demonstrations.
-        draws: K, point subsets for each window where the network reads fewer points than are stored: first one
-            by its `acting_points`, then others by its `training_points`. There is one where no other can differ.
-        seed: decides the subsets, by draws that no training step shares.
+        policy: its encoder is frozen, its normalizer fitted; on the device of `dataset`.
+        dataset: of demonstrations.
+        draws: K, draws of each window where its transforms can give different ones: first one as when acting, then
+            others as in training. There is one where no other can differ.
+        seed: decides the draws, by a stream that no training step shares.
     """
-    points, device = network.config.max_points, windows.action.device
-    choices = [network.config.acting_points, *[network.config.training_points] * (draws - 1)]
-    all_read = points is None or points >= windows.point_cloud.shape[1]
-    if all_read or not any(POINT_CHOICES.get(choice).varies for choice in choices):
-        choices = choices[:1]
-    rows, actions = [], []
-    for number, indices in enumerate(torch.arange(len(windows)).split(_BATCH)):
-        batch = windows.batch(indices)
+    device, kept = dataset.action.device, {"cond", *policy.head.reads}
+    few = dataset.batch(torch.arange(1))
+    count = draws if policy.varies(few) else 1
+    rows: dict[str, list[Tensor]] = {name: [] for name in Features._fields if name in kept}
+    actions = []
+    for number, indices in enumerate(torch.arange(len(dataset)).split(_BATCH)):
+        batch = dataset.batch(indices)
         generator = subset_generator(seed, number, device)
-        subsets = [draw_points(batch, points, generator, choice) for choice in choices]
-        rows.append(torch.stack([network.encode(subset) for subset in subsets], dim=1))  # (b, K, F)
-        actions.append(network.normalizer.normalize(ACTION, batch[ACTION]))
-    return FeatureWindows(torch.cat(rows), torch.cat(actions))
+        drawn = [_as_acting(policy, batch, generator)]
+        drawn += [policy.encode_training(batch, generator) for _ in range(count - 1)]
+        for name, parts in rows.items():
+            parts.append(torch.stack([getattr(features, name) for features in drawn], dim=1))  # (b, K, ...)
+        actions.append(policy.normalizer.normalize(ACTION, batch[ACTION]))
+    return FeatureDataset({name: torch.cat(parts) for name, parts in rows.items()}, torch.cat(actions))
+
+
+def _as_acting(policy: ActionPolicy, batch: Mapping[str, Tensor], generator: torch.Generator) -> Features:
+    """Return the features of what acting reads, with noise from `generator` where the reading depends on it."""
+    noise = None
+    if policy.reads_noise:
+        noise = torch.randn(batch[ACTION].shape, generator=generator, device=batch[ACTION].device)
+    return policy.encode(batch, noise)

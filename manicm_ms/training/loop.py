@@ -17,6 +17,7 @@ from torch import Tensor, nn
 from manicm_ms.errors import CheckpointError, TrainingDivergedError
 from manicm_ms.machine.devices import torch_threads
 from manicm_ms.paths import require_free_space
+from manicm_ms.policies.migration import present_tensors
 from manicm_ms.training.interrupt import stop_requests
 from manicm_ms.training.log import LossBar, RunLog, loss_bar
 from manicm_ms.training.malloc import keep_freed_memory
@@ -170,7 +171,8 @@ class _Training:
         if saved is None:
             return
         tensors, meta = saved
-        missing, unexpected = self.objective.load_state_dict(_under("objective.", tensors), strict=False)
+        changing = present_tensors(_under("objective.", tensors))  # a run may have been begun by the former release
+        missing, unexpected = self.objective.load_state_dict(changing, strict=False)
         unsaved = [k for k in missing if not k.startswith(self.objective.constant)]
         if unsaved or unexpected:
             raise CheckpointError(

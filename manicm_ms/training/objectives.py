@@ -1,4 +1,4 @@
-"""What teachers and students minimise: the diffusion loss, and consistency distillation."""
+"""What is minimised: a head's own loss on demonstrations, and the distillation of a teacher."""
 
 from __future__ import annotations
 
@@ -10,13 +10,22 @@ import torch
 from torch import Tensor
 from torch.nn.functional import mse_loss
 
-from manicm_ms.policies.base import Policy
-from manicm_ms.policies.consistency import ConsistencySolver, CorrectedSolver, PublicSolver, consistency_pair
-from manicm_ms.policies.diffusion import DiffusionPolicy, Guess
-from manicm_ms.policies.manicm import ManiCM
+from manicm_ms.errors import ConfigError
+from manicm_ms.policies.action_policy import ActionPolicy
+from manicm_ms.policies.encoders.encoder import Features
+from manicm_ms.policies.heads.consistency import ConsistencyHead
+from manicm_ms.policies.heads.consistency_solver import (
+    ConsistencySolver,
+    CorrectedSolver,
+    PublicSolver,
+    consistency_pair,
+)
+from manicm_ms.policies.heads.diffusion import DiffusionHead, Guess
+from manicm_ms.policies.heads.head import TrainableHead
+from manicm_ms.policies.methods import METHODS
 from manicm_ms.registry import Registry
 from manicm_ms.spec import ACTION
-from manicm_ms.training.features import CLEAN_ACTION, COND, draw_points
+from manicm_ms.training.features import CLEAN_ACTION, chosen_features
 from manicm_ms.training.loop import Objective
 from manicm_ms.training.optim import ConstantDecay, DecayRule, averaged
 
@@ -26,46 +35,75 @@ class PolicyObjective(Objective):
 
     @property
     @abstractmethod
-    def outcome(self) -> Policy:
+    def outcome(self) -> ActionPolicy:
         """What the training has made so far: the policy to act with and to save."""
 
 
-class DiffusionObjective(PolicyObjective):
-    """Denoising loss (Ho et al. 2020, equation 14): E |output(x_t, t, obs) - target|^2 over t, noise and windows.
-
-    The target is x0 or epsilon, as the policy's `prediction_type` has it.
+class HeadObjective(PolicyObjective):
+    """The loss of a policy's head on demonstrations; the outcome is the policy with its last weights.
 
     Args:
-        policy: trained in place, its normaliser fitted.
-        points: points taken of each cloud in each step, as the network's `training_points` says; None for all.
-        decay: of the averaged weights, which are the outcome.
+        policy: trained in place, its normalizer fitted.
+        decay: of averaged weights, for objectives that have them.
+
+    Raises:
+        ConfigError: the head does not learn from demonstrations alone.
     """
 
-    def __init__(self, policy: DiffusionPolicy, points: int | None, decay: DecayRule) -> None:
+    def __init__(self, policy: ActionPolicy, decay: DecayRule) -> None:
         super().__init__()
-        self.policy, self.points = policy, points
-        self.average = averaged(policy, decay)
+        del decay
+        if not isinstance(policy.head, TrainableHead):
+            raise ConfigError(f"{policy.name} learns from a teacher: train one, and use manicm-ms distill")
+        self.policy = policy
 
     def forward(self, batch: Mapping[str, Tensor], generator: torch.Generator) -> Tensor:
-        """Return the loss of raw windows: `point_cloud`, `agent_pos` and `action` as `Windows.batch` gives them."""
-        policy, network = self.policy, self.policy.network
-        obs = draw_points(batch, self.points, generator, network.config.training_points)
-        x0 = network.normalizer.normalize(ACTION, batch[ACTION])  # (B, Tp, Da)
-        epsilon = torch.randn(x0.shape, generator=generator, device=x0.device)
-        last = policy.diffusion.num_train_timesteps
-        t = torch.randint(last, (len(x0),), generator=generator, device=x0.device)
-        x_t = policy.add_noise(x0, epsilon, t)
-        output = network.denoise(x_t, t, network.encode(obs)).float()
-        return mse_loss(output, policy.prediction.target(x0, epsilon))
+        """Return the loss of raw windows: each observation and `action`, as `SequenceDataset.batch` gives them."""
+        features = self.policy.encode_training(batch, generator)
+        action = self.policy.normalizer.normalize(ACTION, batch[ACTION])  # (B, Tp, Da)
+        return cast(TrainableHead, self.policy.head).loss(features, action, generator)
+
+    def after_step(self) -> None:
+        """Do nothing: no weights are averaged."""
+
+    @property
+    def outcome(self) -> ActionPolicy:
+        """The policy."""
+        return self.policy
+
+
+class AveragedHeadObjective(HeadObjective):
+    """The loss of a policy's head on demonstrations; the outcome is the policy with averaged weights.
+
+    Args:
+        policy: trained in place, its normalizer fitted.
+        decay: of the averaged weights.
+    """
+
+    def __init__(self, policy: ActionPolicy, decay: DecayRule) -> None:
+        super().__init__(policy, decay)
+        self.average = averaged(policy, decay)
 
     def after_step(self) -> None:
         """Average the weights."""
         self.average.update_parameters(self.policy)
 
     @property
-    def outcome(self) -> DiffusionPolicy:
+    def outcome(self) -> ActionPolicy:
         """The policy with averaged weights."""
-        return cast(DiffusionPolicy, self.average.module)
+        return cast(ActionPolicy, self.average.module)
+
+
+OBJECTIVES: Registry[type[HeadObjective]] = Registry("objective")
+"""name -> objective of a training on demonstrations."""
+OBJECTIVES.add("plain", HeadObjective)
+OBJECTIVES.add("averaged", AveragedHeadObjective)
+
+
+def trained_methods() -> tuple[str, ...]:
+    """Return the names of the methods that learn from demonstrations."""
+    known = OBJECTIVES.names()
+    return tuple(name for name in METHODS.names() if METHODS.get(name).objective in known)
 
 
 class Distillation(PolicyObjective):
@@ -73,46 +111,45 @@ class Distillation(PolicyObjective):
 
     L = E |f(x_{n+k}, t_{n+k}) - f^-(x_n, t_n)|^2 (Gao, Lu et al., ManiCM, equation 3), with noise added to
     demonstrated actions, x_n from the teacher, and f^- the target network. Only the U-Net is trained: the
-    encoder stays the teacher's, so that windows come as features (`FeatureWindows`). The outcome is f, not f^-.
+    encoder stays the teacher's, so that windows come as features (`FeatureDataset`). The outcome is f, not f^-.
 
     Args:
         teacher: frozen.
         student: trained in place; starts from the teacher's weights.
-        mu: share that the target network keeps at each step.
+        ema_decay: share that the target network keeps at each step.
     """
 
     constant = ("teacher.",)
 
-    def __init__(self, teacher: DiffusionPolicy, student: ManiCM, mu: float) -> None:
+    def __init__(self, teacher: ActionPolicy, student: ActionPolicy, ema_decay: float) -> None:
         super().__init__()
         self.teacher = teacher.requires_grad_(False)
         self.student = student
-        self.student.network.encoder.requires_grad_(False)
-        self.target = averaged(student, ConstantDecay(mu))
+        self.student.encoder.requires_grad_(False)
+        self.target = averaged(student, ConstantDecay(ema_decay))
 
     @abstractmethod
     def solver(self) -> ConsistencySolver:
         """Return the grid of times and the step back along the teacher's path."""
 
     @abstractmethod
-    def teach(self, x_t: Tensor, t: Tensor, cond: Tensor) -> Guess:
-        """Return what leads the solver, each (B, Tp, Da), for x_t (B, Tp, Da), t (B,), cond (B, F)."""
+    def teach(self, x_t: Tensor, t: Tensor, features: Features) -> Guess:
+        """Return what leads the solver, each (B, Tp, Da), for x_t (B, Tp, Da), t (B,) and the features of B rows."""
 
     def forward(self, batch: Mapping[str, Tensor], generator: torch.Generator) -> Tensor:
-        """Return the loss of a batch of `FeatureWindows`."""
+        """Return the loss of a batch of `FeatureDataset`."""
         x0, device = batch[CLEAN_ACTION], batch[CLEAN_ACTION].device
-        rows, subsets, _ = batch[COND].shape
-        subset = torch.randint(subsets, (rows,), generator=generator, device=device)
-        cond = batch[COND][torch.arange(rows, device=device), subset]  # (B, F)
-        solver, follower = self.solver(), cast(ManiCM, self.target.module)
-        index = torch.randint(len(solver), (rows,), generator=generator, device=device)
+        features = chosen_features(batch, generator)
+        solver, student = self.solver(), cast(ConsistencyHead, self.student.head)
+        follower = cast(ConsistencyHead, cast(ActionPolicy, self.target.module).head)
+        index = torch.randint(len(solver), (len(x0),), generator=generator, device=device)
         epsilon = torch.randn(x0.shape, generator=generator, device=device)
         prediction, wanted = consistency_pair(
             solver,
-            teacher=lambda x_t, t: self.teach(x_t, t, cond),
-            online=lambda x_t, t: self.student.consistency_function(x_t, t, cond),
-            target=lambda x_t, t: follower.consistency_function(x_t, t, cond),
-            x_t=self.teacher.add_noise(x0, epsilon, solver.timesteps[index]),
+            teacher=lambda x_t, t: self.teach(x_t, t, features),
+            online=lambda x_t, t: student.consistency_function(x_t, t, features),
+            target=lambda x_t, t: follower.consistency_function(x_t, t, features),
+            x_t=self.teacher_head.add_noise(x0, epsilon, solver.timesteps[index]),
             index=index,
         )
         return mse_loss(prediction, wanted)
@@ -122,7 +159,12 @@ class Distillation(PolicyObjective):
         self.target.update_parameters(self.student)
 
     @property
-    def outcome(self) -> ManiCM:
+    def teacher_head(self) -> DiffusionHead:
+        """The teacher's head."""
+        return cast(DiffusionHead, self.teacher.head)
+
+    @property
+    def outcome(self) -> ActionPolicy:
         """The student."""
         return self.student
 
@@ -136,14 +178,11 @@ class ConsistencyDistillation(Distillation):
 
     def solver(self) -> ConsistencySolver:
         """Return DDIM, ending at alpha_bar = 1."""
-        config = self.student.consistency
-        return CorrectedSolver(
-            self.student.alphas_cumprod, config.num_solver_steps, timestep_spacing=config.timestep_spacing
-        )
+        return _on_grid_of(CorrectedSolver, self.student)
 
-    def teach(self, x_t: Tensor, t: Tensor, cond: Tensor) -> Guess:
+    def teach(self, x_t: Tensor, t: Tensor, features: Features) -> Guess:
         """Return the teacher's x0, clipped, and the epsilon of its unclipped output, as in its sampling."""
-        return self.teacher.guess(x_t, t, cond)
+        return self.teacher_head.guess(x_t, t, features)
 
 
 @DISTILLATIONS.register("public-consistency")
@@ -156,13 +195,14 @@ class PublicConsistencyDistillation(Distillation):
 
     def solver(self) -> ConsistencySolver:
         """Return the public code's step."""
-        config = self.student.consistency
-        return PublicSolver(
-            self.student.alphas_cumprod, config.num_solver_steps, timestep_spacing=config.timestep_spacing
-        )
+        return _on_grid_of(PublicSolver, self.student)
 
-    def teach(self, x_t: Tensor, t: Tensor, cond: Tensor) -> Guess:
+    def teach(self, x_t: Tensor, t: Tensor, features: Features) -> Guess:
         """Return the teacher's x0 as the network gives it, and its epsilon, which this solver does not use."""
-        output, prediction = self.teacher.network.denoise(x_t, t, cond).float(), self.teacher.prediction
-        alpha_bar = self.teacher.alphas_cumprod[t][:, None, None]
-        return Guess(prediction.x0(output, x_t, alpha_bar), prediction.epsilon(output, x_t, alpha_bar))
+        return self.teacher_head.raw_guess(x_t, t, features)
+
+
+def _on_grid_of(solver: type[CorrectedSolver] | type[PublicSolver], student: ActionPolicy) -> ConsistencySolver:
+    """Return a solver on the grid of times on which the student is defined."""
+    head = cast(ConsistencyHead, student.head)
+    return solver(head.alphas_cumprod, head.config.num_solver_steps, timestep_spacing=head.config.timestep_spacing)

@@ -91,21 +91,21 @@ DecayRule = Callable[[int], float]
 
 @dataclass(frozen=True)
 class ConstantDecay:
-    """Keep `mu` of the old average: theta' <- mu theta' + (1 - mu) theta (target network of Song et al. 2023).
+    """Keep a share of the old average: theta' <- d theta' + (1 - d) theta (target network of Song et al. 2023).
 
     Attributes:
-        mu: in [0, 1).
+        ema_decay: d, in [0, 1).
     """
 
-    mu: float = 0.95
+    ema_decay: float = 0.95
 
     def __post_init__(self) -> None:
-        if not 0 <= self.mu < 1:
-            raise ConfigError(f"the decay of an average must lie in [0, 1), got {self.mu}")
+        if not 0 <= self.ema_decay < 1:
+            raise ConfigError(f"the decay of an average must lie in [0, 1), got {self.ema_decay}")
 
     def __call__(self, count: int) -> float:
-        """Return `mu`."""
-        return self.mu
+        """Return `ema_decay`."""
+        return self.ema_decay
 
 
 @dataclass(frozen=True)

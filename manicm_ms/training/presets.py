@@ -2,72 +2,65 @@
 
 from __future__ import annotations
 
-from dataclasses import asdict, dataclass
-from typing import Any
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass, field, fields, replace
+from typing import Any, Self, TypeVar, get_type_hints
 
-from manicm_ms.errors import ConfigError, require_at_least
-from manicm_ms.policies.points import POINT_CHOICES
+from manicm_ms.errors import ConfigError, UnknownNameError, require_at_least
+from manicm_ms.policies.configuration import Nested, merged, typed
+from manicm_ms.policies.methods import METHODS
 from manicm_ms.registry import Registry
-from manicm_ms.spec import ChunkSpec
 from manicm_ms.training.optim import FitConfig
+
+SIZES = ("smoke", "quick", "paper")
+"""What a preset may be called the size of: each part says what it means by them."""
+CHUNK, TRAINING = "chunk", "training"
+"""Sections beside those of a policy: its lengths, and the fields of a preset."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class TeacherPreset(FitConfig):
-    """How to train a diffusion teacher.
+    """How to train a policy on demonstrations: a size, steps and optimiser.
+
+    What a size means, each encoder, backbone, head and input transform says itself (`sizes`); chunk and parts are the
+    method's.
 
     Attributes:
-        n_obs_steps: To, frames read.
-        horizon: Tp, actions predicted.
-        n_action_steps: Ta, actions executed.
-        prediction_type: what the network predicts: "sample" (x0) or "epsilon" (noise).
-        cloud_frame: "base" leaves the cloud where it is and scales it to [-1, 1]; "tcp" takes it relative to the
-            tool centre point, in units of `cloud_scale`: 20 of 50 episodes more on Meta-World's pick-place. "auto" is
-            tcp where agent_pos holds that point, else base (a hand without an arm's tool, as Adroit's).
-        cloud_scale: metres that become 1 with `cloud_frame` "tcp"; unused with "base".
-        points: points read of each cloud, in training and when acting; None uses them all.
-        acting_points: which ones when acting: "prefix" (clouds are stored in farthest-point order, so a prefix is a
-            coarser cloud) or "random" (drawn anew for each decision, from its noise).
-        training_points: which ones in each step of training: "random" or "prefix".
-        min_state_range: least range of a channel of agent_pos in its unit (metres, radians, entries of a rotation): a
-            channel that moves less in the demonstrations is not stretched to [-1, 1]. 0 stretches it, as DP3 does.
-        down_dims: channels of the U-Net's stages, or None for the policy's own.
-        ema_power: of the averaged weights, which are the teacher in the end; see `PowerDecay`.
+        size: "smoke", "quick" or "paper".
+        ema_power: of the averaged weights, which are the policy in the end where the method averages; see `PowerDecay`.
         ema_max_decay: never keep more than this of the old average.
         precision: used unless the command names another; see `resolve_precision`.
+        changes: departures from the method's configuration, nested sections as those of `build_policy`, and `chunk`.
     """
 
-    n_obs_steps: int = 2
-    horizon: int = 4
-    n_action_steps: int = 3
-    prediction_type: str = "sample"
-    cloud_frame: str = "base"
-    cloud_scale: float = 0.15
-    points: int | None = None
-    acting_points: str = "prefix"
-    training_points: str = "random"
-    min_state_range: float = 0.0
-    down_dims: tuple[int, ...] | None = None
+    size: str = "paper"
     ema_power: float = 0.75
     ema_max_decay: float = 0.9999
     precision: str = "auto"
+    changes: Nested = field(default_factory=dict)
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        if self.points is not None and self.points < 1:
-            raise ConfigError(f"points must be at least 1 or None, got {self.points}")
-        POINT_CHOICES.get(self.acting_points)
-        POINT_CHOICES.get(self.training_points)
-        if self.cloud_scale <= 0:
-            raise ConfigError(f"cloud_scale must be positive (metres), got {self.cloud_scale}")
-        if not self.min_state_range >= 0:
-            raise ConfigError(f"min_state_range must be at least 0, got {self.min_state_range}")
-        _ = self.chunk  # checks the three lengths against each other
+        if self.size not in SIZES:
+            raise UnknownNameError("size", self.size, SIZES)
 
-    @property
-    def chunk(self) -> ChunkSpec:
-        """To, Tp, Ta."""
-        return ChunkSpec(self.n_obs_steps, self.horizon, self.n_action_steps)
+    def configuration(self, method: str) -> dict[str, Any]:
+        """Return the nested configuration of this method's policy, and its lengths as the section `chunk`.
+
+        Raises UnknownNameError or ConfigError where the method or something in `changes` does not exist or fit.
+        """
+        row, changes = METHODS.get(method), dict(self.changes)
+        chunk = row.chunk_of(self.size, _lengths(changes.pop(CHUNK, {})))
+        return {CHUNK: asdict(chunk), **row.configuration(self.size, changes)}
+
+    def with_changes(self, changes: Nested) -> Self:
+        """Return the preset with more departures; the section `training` holds fields of the preset itself.
+
+        Raises:
+            UnknownNameError: the preset has no such field.
+            ConfigError: a value is of another type or out of range.
+        """
+        return _with_changes(self, changes)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -76,8 +69,8 @@ class StudentPreset(FitConfig):
 
     Attributes:
         objective: name in `DISTILLATIONS`: "consistency", or "public-consistency" for comparison only.
-        skip: k, training timesteps that one step of the solver spans.
-        mu: share that the target network keeps at each step, in [0, 1).
+        solver_stride: k, training timesteps that one step of the solver spans.
+        ema_decay: share that the target network keeps at each step, in [0, 1).
         draws: random point subsets for which the frozen encoder's features are computed, once each, where the
             teacher reads fewer points than are stored; with the full cloud there is only one.
         nfe: network evaluations of the student when acting: 1, or 4 for a little more precision.
@@ -85,31 +78,55 @@ class StudentPreset(FitConfig):
     """
 
     objective: str = "consistency"
-    skip: int = 10
-    mu: float = 0.95
+    solver_stride: int = 10
+    ema_decay: float = 0.95
     draws: int = 4
     nfe: int = 1
     precision: str = "auto"
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        require_at_least(1, skip=self.skip, draws=self.draws, nfe=self.nfe)
-        if not 0 <= self.mu < 1:
-            raise ConfigError(f"mu must lie in [0, 1), got {self.mu}")
+        require_at_least(1, solver_stride=self.solver_stride, draws=self.draws, nfe=self.nfe)
+        if not 0 <= self.ema_decay < 1:
+            raise ConfigError(f"ema_decay must lie in [0, 1), got {self.ema_decay}")
+
+    def with_changes(self, changes: Nested) -> Self:
+        """Return the preset with the fields that the section `training` holds; it has no other section."""
+        return _with_changes(self, changes)
 
 
-_ADDED_LATER = {"acting_points": "prefix", "training_points": "random", "min_state_range": 0.0}
-"""Fields that presets got after runs were made with them, with what those runs did."""
+Preset = TypeVar("Preset", bound=FitConfig)
 
 
-def preset_identity(preset: FitConfig) -> dict[str, Any]:
-    """Return the fields that tell one preset from another, JSON values.
+def _with_changes(preset: Preset, changes: Nested) -> Preset:
+    rest = dict(changes)
+    training = rest.pop(TRAINING, {})
+    if not isinstance(training, Mapping):
+        raise ConfigError(f"{TRAINING} takes keys of its own, as in {TRAINING}.steps; got {training!r}")
+    known = [f.name for f in fields(preset) if f.name != "changes"]
+    hints = get_type_hints(type(preset))
+    for name in training:
+        if name not in known:
+            raise UnknownNameError("configuration key", f"{TRAINING}.{name}", [f"{TRAINING}.{k}" for k in known])
+    values = {name: typed(value, hints[name], f"{TRAINING}.{name}") for name, value in training.items()}
+    if "steps" in values and "epochs" not in values:
+        values["epochs"] = None
+    if isinstance(preset, TeacherPreset):
+        values["changes"] = merged(preset.changes, rest)
+    elif rest:
+        raise UnknownNameError("configuration key", next(iter(rest)), [TRAINING])
+    return replace(preset, **values)
 
-    A field that was added later is left out where it says what was done before, so that older runs still are the same
-    run: they go on, or are found finished.
-    """
-    values = asdict(preset)
-    return {k: v for k, v in values.items() if not (k in _ADDED_LATER and v == _ADDED_LATER[k])}
+
+def _lengths(section_: Any) -> Nested:
+    if not isinstance(section_, Mapping):
+        raise ConfigError(f"{CHUNK} takes keys of its own, as in {CHUNK}.horizon; got {section_!r}")
+    return section_
+
+
+def preset_for(method: str, name: str) -> TeacherPreset:
+    """Return the preset called `name` with what the method itself says of the optimiser."""
+    return replace(TEACHER_PRESETS.get(name), **METHODS.get(method).optimizer)
 
 
 TEACHER_PRESETS: Registry[TeacherPreset] = Registry("teacher preset")
@@ -123,24 +140,12 @@ TEACHER_PRESETS.add(
         learning_rate=1e-3,
         warmup_steps=100,
         clip_norm=1.0,
-        cloud_frame="auto",
-        points=128,
-        min_state_range=0.02,
-        down_dims=(64, 128, 256),
+        size="quick",
     ),
 )
 TEACHER_PRESETS.add(
     "smoke",  # some seconds: shows that everything runs, and learns next to nothing
-    TeacherPreset(
-        steps=30,
-        batch_size=16,
-        warmup_steps=5,
-        cloud_frame="auto",
-        points=64,
-        min_state_range=0.02,
-        down_dims=(32, 64),
-        save_every=15,
-    ),
+    TeacherPreset(steps=30, batch_size=16, warmup_steps=5, save_every=15, size="smoke"),
 )
 TEACHER_PRESETS.add(
     "paper",  # DP3's public configuration with the horizon of the ManiCM paper, section 4.1
@@ -150,7 +155,6 @@ TEACHER_PRESETS.add(
         learning_rate=1e-4,
         warmup_steps=500,
         clip_norm=None,
-        n_action_steps=2,
         log_every=100,
         save_every=2000,
         precision="32-true",

@@ -23,7 +23,6 @@ from manicm_ms.training.device import make_fabric, resolve_precision
 from manicm_ms.training.loop import Batches, FitResult, Snapshots, fit
 from manicm_ms.training.objectives import PolicyObjective
 from manicm_ms.training.optim import FitConfig
-from manicm_ms.training.presets import preset_identity
 from manicm_ms.training.run_folder import RunFolder, open_run, snapshot_folder, training_folder
 
 _NOT_IDENTITY = ("log_every", "save_every", "precision")  # the precision that is used stands beside the preset
@@ -102,7 +101,7 @@ class Session:
         """Train and write the checkpoint, or go on with what an earlier process left, or find it all done.
 
         Args:
-            inputs: what decides the weights beside preset, precision and seed, JSON values.
+            inputs: what decides the weights beside precision and seed, JSON values; `preset` is that of the preset.
             provenance: of the inputs, for the checkpoint.
             build: makes objective and data, the same at each call.
             snapshots: checkpoints kept on the way, at even distances, the last one at the end; see `snapshot_folders`.
@@ -117,7 +116,7 @@ class Session:
         identity = {
             "kind": self.kind,
             **inputs,
-            "preset": {k: v for k, v in preset_identity(self.preset).items() if k not in _NOT_IDENTITY},
+            "preset": {k: v for k, v in inputs["preset"].items() if k not in _NOT_IDENTITY},
             "precision": self.precision,
             "seed": self.seed,
         }

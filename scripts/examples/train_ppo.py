@@ -290,7 +290,7 @@ class CurveCallback(BaseCallback):
         late = limit is not None and time.monotonic() - self._began > 60 * limit
         return not (self._stop.asked or late)
 
-    def _on_rollout_start(self) -> None:  # the update that used the last roll-out has been done
+    def _on_rollout_start(self) -> None:  # the update that used the last rollout has been done
         if HELD * self.num_timesteps - self._points[-1]["steps"] >= self._args.eval_every:
             self._evaluate()
 

@@ -20,18 +20,20 @@ from kit import Budget, Results, part_arguments, results_of
 from torch import Tensor, nn
 
 from manicm_ms.bench.latency import CHUNK, TEACHERS, door_spec
-from manicm_ms.evaluation.latency import example_observation
 from manicm_ms.evaluation.machine import machine
 from manicm_ms.machine.devices import resolve_device
-from manicm_ms.policies.base import Policy, make_policy
-from manicm_ms.policies.manicm import ManiCM
+from manicm_ms.policies.action_policy import ActionPolicy
+from manicm_ms.policies.backbones.unet1d import UNet1D
+from manicm_ms.policies.encoders.encoder import Features
+from manicm_ms.policies.methods import make_policy, student_of, with_nfe
+from manicm_ms.policies.policy import Policy, example_observations
 
 PART = "latency"
 WARM_UP, FEWEST, MOST, ROW_S = 3, 5, 200, 1.0  # calls before the clock; timed calls at least, at most; seconds a row
 BATCHES, NFES = (1, 32), (1, 10, 4)  # in order of value
 SMOKE_BATCHES, SMOKE_CALLS = (1, 2), 1
 COPY_BYTES, COPIES = 1 << 30, 10
-TINY = {"network": {"down_dims": (16, 32)}}
+TINY = {"backbone": {"down_dims": (16, 32)}}
 
 
 @dataclass(frozen=True)
@@ -65,18 +67,24 @@ def rows(mode: str, smoke: bool) -> Iterator[Row]:
 # ---- policies -----------------------------------------------------------------------------------------------------
 
 
-def in_bfloat16(policy: Policy) -> Policy:
-    """Return a copy whose encoder and U-Net hold and multiply bfloat16; noise, sampler and normaliser stay float32."""
+def in_bfloat16(policy: ActionPolicy) -> ActionPolicy:
+    """Return a copy whose encoder and U-Net hold and multiply bfloat16; noise, sampler and normalizer stay float32."""
     half = copy.deepcopy(policy)
-    network: Any = half.network
+    unet = half.head.backbone
+    assert isinstance(unet, UNet1D)
 
-    def cast(_module: nn.Module, inputs: tuple[Tensor, ...]) -> tuple[Tensor, ...]:
-        return tuple(x.to(torch.bfloat16) if x.is_floating_point() else x for x in inputs)
+    def cast(value: Any) -> Any:
+        if isinstance(value, Features):
+            return Features(value.cond.to(torch.bfloat16))
+        if isinstance(value, dict):
+            return {key: cast(v) for key, v in value.items()}
+        return value.to(torch.bfloat16) if isinstance(value, Tensor) and value.is_floating_point() else value
 
-    for part in (network.encoder, network.unet):
-        part.to(torch.bfloat16).register_forward_pre_hook(cast)
+    for part in (half.encoder, unet):
+        part.to(torch.bfloat16).register_forward_pre_hook(lambda _m, inputs: tuple(cast(x) for x in inputs))
     # The embedding of the time is computed in float32 from an integer.
-    network.unet.time_embedding[0].register_forward_hook(lambda _m, _i, output: output.to(torch.bfloat16))
+    for embedding in unet.time_embeddings:
+        embedding[0].register_forward_hook(lambda _m, _i, output: output.to(torch.bfloat16))  # type: ignore[index]
     return half
 
 
@@ -93,9 +101,9 @@ def policies(device: torch.device, smoke: bool) -> Policies:
             ("float32", copy.deepcopy(teacher).to(device)),
             ("bfloat16", in_bfloat16(teacher).to(device)),
         ):
-            student = ManiCM.from_teacher(copied).to(copied.device).eval()  # type: ignore[arg-type]
+            student = student_of(copied).eval()
             for nfe in NFES:
-                made[model, dtype, nfe] = copied if nfe == copied.nfe else student.with_nfe(nfe).eval()
+                made[model, dtype, nfe] = copied if nfe == copied.nfe else with_nfe(student, nfe).eval()
     return made
 
 
@@ -104,7 +112,7 @@ def policies(device: torch.device, smoke: bool) -> Policies:
 
 def starting_point(policy: Policy, batch: int) -> tuple[dict[str, Tensor], Tensor]:
     """Return an observation of `batch` equal rows and noise (draws, batch, Tp, Da), equal in all rows, on the CPU."""
-    one = example_observation(policy.spec, policy.chunk)
+    one = example_observations(policy)
     shape = (policy.noise_draws, 1, policy.chunk.horizon, policy.spec.action.dim)
     noise = torch.randn(shape, generator=torch.Generator().manual_seed(1))
     return {key: value.repeat(batch, *[1] * (value.dim() - 1)) for key, value in one.items()}, noise.repeat(
@@ -223,12 +231,13 @@ def bandwidth_gb_s(device: torch.device, size: int) -> float:
 
 def weight_bytes(policy: Policy) -> int:
     """Return the fewest bytes of weights that a decision reads: the encoder once, the U-Net at each evaluation."""
-    network: Any = policy.network
+    assert isinstance(policy, ActionPolicy)
+    assert policy.head.backbone is not None
 
     def held(module: nn.Module) -> int:
         return sum(p.numel() * p.element_size() for p in module.parameters())
 
-    return held(network.encoder) + policy.nfe * held(network.unet)
+    return held(policy.encoder) + policy.nfe * held(policy.head.backbone)
 
 
 def measure(row: Row, made: Policies, bandwidth: float, most: int) -> dict[str, Any]:

@@ -1,4 +1,4 @@
-"""Part 3 of the GPU kit: SAPIEN's pictures by the GPU's own driver, the promises of the environments, and their speed.
+"""Part 3 of the GPU kit: SAPIEN's pictures by the GPU's own driver, conformance checks, and speed.
 
 Physics runs on the CPU, a process a row. The NVIDIA driver makes the pictures where a first one succeeds within its
 time, which it does not on every machine; a second call then brings a software driver. Each line says which it was.
@@ -97,7 +97,7 @@ def environment(variables: Mapping[str, str]) -> dict[str, str]:
     return {**kept, **variables}
 
 
-# ---- speed and promises -------------------------------------------------------------------------------------------
+# ---- speed and checks ---------------------------------------------------------------------------------------------
 
 
 def rate(env_id: str, workers: int, steps: int, repetitions: int) -> dict[str, Any]:
@@ -136,7 +136,7 @@ def measure_rates(args: argparse.Namespace, results: Results, budget: Budget, va
     return complete
 
 
-def check_promises(args: argparse.Namespace, results: Results, budget: Budget, variables: Mapping[str, str]) -> bool:
+def check_conformance(args: argparse.Namespace, results: Results, budget: Budget, variables: Mapping[str, str]) -> bool:
     """Run `manicm-ms check` on each task while there is time, a line each, and return whether all passed."""
     complete = True
     for task in SMOKE_TASKS if args.smoke else TASKS:
@@ -192,7 +192,7 @@ def main() -> int:
         return 1
     complete = measure_rates(args, results, budget, variables)
     if not args.skip_check:
-        complete &= check_promises(args, results, budget, variables)
+        complete &= check_conformance(args, results, budget, variables)
     return 0 if complete else 1
 
 

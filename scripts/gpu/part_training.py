@@ -22,15 +22,16 @@ from kit import FILE_BACK_BYTES, Budget, Results, last_error, part_arguments, re
 from rich.console import Console
 
 from manicm_ms.demos.layout import store_path
+from manicm_ms.demos.sequence_dataset import SequenceDataset
 from manicm_ms.demos.store import DemoStore
-from manicm_ms.demos.windows import Windows
 from manicm_ms.policies.checkpoint import load_checkpoint, read_manifest, save_checkpoint
+from manicm_ms.policies.methods import METHODS
+from manicm_ms.training.distill import distill
 from manicm_ms.training.interrupt import stop_requests
 from manicm_ms.training.optim import FitConfig
 from manicm_ms.training.presets import STUDENT_PRESETS, TEACHER_PRESETS, StudentPreset, TeacherPreset
 from manicm_ms.training.run_folder import snapshot_folders
-from manicm_ms.training.student import distill
-from manicm_ms.training.teacher import train_teacher
+from manicm_ms.training.train import train as train_policy
 
 PART = "training"
 POLICY = "simple_dp3"
@@ -41,7 +42,8 @@ WARM_UP_STEPS, TIMED_STEPS = 20, 200
 CAUTION, PATIENCE = 0.9, 1.15  # shares of the time: planned for, and after which a training is ended
 MOST_ABOVE_WHOLE = 3.0  # speed of the steps over that of the whole short training, overhead included: more is an error
 SNAPSHOTS = 5  # kept on the way
-SMOKE = {"batch_size": 8, "points": 32, "down_dims": (16, 32)}
+SMOKE_BATCH = 8
+SMOKE = {"inputs": {"points": {"max_points": 32}}, "backbone": {"down_dims": (16, 32)}}
 SMOKE_STEPS = (2, 4)
 F = TypeVar("F", TeacherPreset, StudentPreset)
 Train = Callable[[Any, Path], Path]
@@ -192,7 +194,7 @@ class Task:
         self.teacher = self.folder / "teacher"  # or where its last snapshot lies
         self.common = {"device": args.device, "console": Console(quiet=True), "command": "scripts/gpu/part_training.py"}
         with DemoStore.open(self.store) as store:
-            self.windows = len(Windows.from_store(store, TEACHER_PRESETS.get("paper").chunk))
+            self.windows = len(SequenceDataset.from_store(store, METHODS.get(POLICY).chunk_of("paper")))
             self.episodes = len(store)
 
     def run(self, kind: str, seconds: float) -> dict[str, Any]:
@@ -206,10 +208,10 @@ class Task:
     def _train_teacher(self, seconds: float) -> Trained:
         preset = TEACHER_PRESETS.get("paper")
         if self.args.smoke:
-            preset = replace(preset, **SMOKE)  # type: ignore[arg-type]
+            preset = replace(preset, batch_size=SMOKE_BATCH, changes=SMOKE)
 
         def train(shorter: TeacherPreset, out: Path) -> Path:
-            return train_teacher(POLICY, self.store, out, shorter, snapshots=SNAPSHOTS, **self.common)
+            return train_policy(POLICY, self.store, out, shorter, snapshots=SNAPSHOTS, **self.common)
 
         made = train_one(train, preset, self.folder / "teacher", seconds, self.windows, self.args.smoke)
         self.teacher = made.checkpoint
@@ -218,7 +220,7 @@ class Task:
     def _train_student(self, seconds: float) -> Trained:
         preset = STUDENT_PRESETS.get("paper")
         if self.args.smoke:
-            preset = replace(preset, batch_size=SMOKE["batch_size"])  # type: ignore[arg-type]
+            preset = replace(preset, batch_size=SMOKE_BATCH)
 
         def train(shorter: StudentPreset, out: Path) -> Path:
             return distill(self.teacher, self.store, out, shorter, snapshots=SNAPSHOTS, **self.common)

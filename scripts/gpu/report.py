@@ -79,12 +79,12 @@ def simulation(lines: Sequence[Line]) -> str:
         "best": lambda x: x["best"],
         "pictures by": lambda x: x["device"],
     }
-    promises: dict[str, Callable[[Line], Any]] = {
+    conformance: dict[str, Callable[[Line], Any]] = {
         "task": lambda x: x["task"],
-        "promises kept": lambda x: x["passed"],
+        "checks passed": lambda x: x["passed"],
         "broken": lambda x: "; ".join(x["broken"]) or x.get("failed", "none"),
     }
-    parts = ["\n".join(tried), table(speed, rates) if rates else "", table(promises, checks) if checks else ""]
+    parts = ["\n".join(tried), table(speed, rates) if rates else "", table(conformance, checks) if checks else ""]
     return "## Simulation\n\n" + "\n\n".join(filter(None, parts)) if mine else ""
 
 

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import torch
@@ -19,9 +18,8 @@ from torch import Tensor
 from manicm_ms.envs.vec_env import make_vec
 from manicm_ms.evaluation.rollout import rollout
 from manicm_ms.machine.devices import torch_threads
-from manicm_ms.policies.base import Policy
 from manicm_ms.policies.checkpoint import load_checkpoint
-from manicm_ms.policies.diffusion import DiffusionPolicy, OneStepTeacher
+from manicm_ms.policies.policy import Policy
 
 
 class OwnNoise(Policy):
@@ -38,14 +36,6 @@ class OwnNoise(Policy):
     def nfe(self) -> int:
         """That of the policy."""
         return self.policy.nfe
-
-    def config_dict(self) -> dict[str, Any]:
-        """Return the policy's configuration."""
-        return self.policy.config_dict()
-
-    def fit_normalizer(self, stats: Mapping[str, Any]) -> None:
-        """Set the policy's normaliser."""
-        self.policy.fit_normalizer(stats)
 
     def act(
         self, obs: Mapping[str, Tensor], *, generator: torch.Generator | None = None, noise: Tensor | None = None
@@ -64,7 +54,8 @@ def main(checkpoint: tyro.conf.Positional[Path], episodes: int = 100, seed: int 
         seed: the first of them.
     """
     policy = load_checkpoint(checkpoint)
-    players = [policy, OneStepTeacher(policy)] if isinstance(policy, DiffusionPolicy) else [policy]
+    control = policy.one_step()
+    players = [policy] if control is None else [policy, control]
     env = make_vec("ur3e/slide-block", 2, "cpu", chunk=policy.chunk)
     try:
         with torch_threads(1):

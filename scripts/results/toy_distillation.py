@@ -17,15 +17,15 @@ from pathlib import Path
 import torch
 from torch import Tensor, nn
 
-from manicm_ms.policies.consistency import (
+from manicm_ms.policies.backbones.unet1d import SinusoidalEmbedding
+from manicm_ms.policies.heads.consistency_solver import (
     ConsistencySolver,
     CorrectedSolver,
     PublicSolver,
     boundary_scalings,
     consistency_pair,
 )
-from manicm_ms.policies.diffusion import DiffusionConfig, Guess, epsilon_from_x0
-from manicm_ms.policies.unet1d import SinusoidalEmbedding
+from manicm_ms.policies.heads.diffusion import DiffusionConfig, Guess, epsilon_from_x0
 
 DIFFUSION = DiffusionConfig()
 ABAR = DIFFUSION.ddpm().alphas_cumprod

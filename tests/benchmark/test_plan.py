@@ -5,7 +5,7 @@ from pathlib import Path
 import pytest
 
 from manicm_ms.benchmark.jobs import all_jobs
-from manicm_ms.benchmark.methods import OneStep, Student, Teacher, parse_methods
+from manicm_ms.benchmark.methods import OneStep, Student, Trained, parse_methods
 from manicm_ms.benchmark.plan import Plan, parse_envs, parse_seeds
 from manicm_ms.envs.simulator import ENVS
 from manicm_ms.errors import ConfigError, UnknownNameError
@@ -21,9 +21,9 @@ def plan(**changes):
 
 def test_students_and_controls_come_from_the_one_teacher_named_or_from_the_default():
     assert parse_methods(["dp3", "manicm", "one_step"]) == (
-        Teacher("dp3"), Student("manicm", Teacher("dp3"), 1), OneStep("one_step", Teacher("dp3")),
+        Trained("dp3"), Student("manicm", Trained("dp3"), 1), OneStep("one_step", Trained("dp3")),
     )  # fmt: skip
-    assert parse_methods(["manicm_4"]) == (Student("manicm_4", Teacher("simple_dp3"), 4),)
+    assert parse_methods(["manicm_4"]) == (Student("manicm_4", Trained("simple_dp3"), 4),)
     both = parse_methods(["dp3", "simple_dp3", "manicm:dp3", "manicm:simple_dp3"])
     assert [m.made_from.name for m in both if m.made_from] == ["dp3", "simple_dp3"]
 

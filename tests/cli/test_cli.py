@@ -1,5 +1,6 @@
 """`manicm-ms` as its users meet it: exit statuses, one-line errors, presets as options, and going on after Ctrl-C."""
 
+import json
 import os
 import re
 import signal
@@ -140,7 +141,7 @@ def test_unknown_command_in_a_real_process():
     [
         ("train dp3 --data DATA --out OUT --preset quik", "unknown teacher preset 'quik': did you mean 'quick'?"),
         ("distill --teacher T --data DATA --out OUT --preset=papr", "'papr': did you mean 'paper'?"),
-        ("train dp33 --data DATA --out OUT --preset smoke", "unknown teacher policy 'dp33': did you mean 'dp3'?"),
+        ("train dp33 --data DATA --out OUT --preset smoke", "unknown method 'dp33': did you mean 'dp3'?"),
         ("collect ur3e/slide-blok --out OUT", "'ur3e/slide-blok': did you mean 'ur3e/slide-block'?"),
         ("collect button-press-v2", "unknown env id 'button-press-v2': it is called 'metaworld/button-press' here"),
         ("collect metaworld/hamer", "did you mean 'metaworld/hammer'?"),
@@ -162,6 +163,18 @@ def test_unknown_command_in_a_real_process():
             "n_action_steps=4 exceeds horizon - n_obs_steps + 1 = 3",
         ),
         ("train dp3 --data DATA --out OUT --steps 20", "warmup_steps=100 leaves nothing of steps=20"),
+        ("train manicm --data DATA --out OUT --points 8", "manicm learns from a teacher, not from demonstrations"),
+        ("train dp3 --data DATA --out OUT --points 8 --set head.steps=4", "unknown configuration key 'head.steps'"),
+        ("train dp3 --data DATA --out OUT --points 8 --set unet.width=4", "unknown configuration key 'unet'"),
+        ("train dp3 --data DATA --out OUT --set head", "an override is written KEY=VALUE"),
+        ("train dp3 --data DATA --out OUT --set head=difusion", "unknown head 'difusion': did you mean 'diffusion'?"),
+        ("train dp3 --data DATA --out OUT --set chunk.horizon=wide", "chunk.horizon takes a whole number, got 'wide'"),
+        ("train dp3 --data DATA --out OUT --set training.step=4", "did you mean 'training.steps'?"),
+        ("train dp3 --data DATA --out OUT --config NOWHERE", "there is no configuration file NOWHERE: check the path"),
+        ("train dp3 --data DATA --out OUT --config DATA", "cannot be read"),
+        ("distill --teacher T --data DATA --out OUT --set head.nfe=4", "unknown configuration key 'head'"),
+        ("distill --teacher T --data DATA --out OUT --set training.nfe=many", "training.nfe takes a whole number"),
+        ("distill --teacher T --data DATA --out OUT --ema-decay 1.0", "ema_decay must lie in [0, 1), got 1.0"),
         ("check", "name at least one environment id"),
         ("evaluate --env ur3e/slide-block", "name at least one checkpoint folder"),
     ],
@@ -276,6 +289,80 @@ def test_ctrl_c_ends_with_130_and_the_same_command_goes_on(told, demos, tmp_path
     assert [line["step"] for line in read_log(log)] == list(range(1, STEPS + 1))
     assert read_manifest(teacher)["provenance"]["command"].startswith("manicm-ms train simple_dp3 --data ")
     assert f"{teacher} is finished: nothing to do" in told(*command)[2]
+
+
+# ---- configuration: fields by name, files, overrides
+
+
+def trained(told, demos, out, *options):
+    """Train some steps; return the checkpoint's configuration and the manifest's provenance."""
+    small = f"--steps 3 --warmup-steps 1 --batch-size 4 --save-every 50 --device cpu --out {out} --data {demos}"
+    status, _, err = told("train", "simple_dp3", *small.split(), *options)
+    assert status == 0, err
+    return json.loads((out / "config.json").read_text()), read_manifest(out)["provenance"]
+
+
+def test_a_file_an_option_and_an_override_name_the_same_key_and_the_last_of_them_stands(told, demos, tmp_path):
+    path = tmp_path / "small.yaml"
+    path.write_text(
+        "backbone: {down_dims: [8, 16], mid_blocks: 2}\n"
+        "inputs:\n  points: {max_points: 8}\n"
+        "head: {num_inference_steps: 5}\nchunk: {horizon: 8}\ntraining: {ema_power: 0.5}\n"
+    )
+    options = (
+        "--config",
+        path,
+        "--points",
+        16,
+        "--set",
+        "head.num_inference_steps=2",
+        "--set",
+        "chunk.n_action_steps=5",
+    )
+    described, made = trained(told, demos, tmp_path / "out", *options)
+    config = described["config"]
+    assert (config["backbone"]["down_dims"], config["backbone"]["mid_blocks"]) == ([8, 16], 2)
+    assert config["inputs"]["points"]["max_points"] == 16
+    assert config["head"]["num_inference_steps"] == 2
+    assert described["chunk"] == {"n_obs_steps": 2, "horizon": 8, "n_action_steps": 5}
+    assert made["preset"]["steps"] == 3
+
+
+def test_a_short_option_and_its_key_are_the_same_run(told, demos, tmp_path):
+    out = tmp_path / "out"
+    trained(told, demos, out, "--down-dims", 8, 16, "--points", 8)
+    small = ("--steps", 3, "--warmup-steps", 1, "--batch-size", 4, "--save-every", 50, "--device", "cpu")
+    keys = ("--set", "backbone.down_dims=8,16", "--set", "inputs.points.max_points=8")
+    status, _, err = told("train", "simple_dp3", "--data", demos, "--out", out, *small, *keys)
+    assert status == 0
+    assert "is finished: nothing to do" in err
+
+
+def test_a_field_of_a_file_is_not_undone_by_the_presets_value(told, demos, tmp_path):
+    path = tmp_path / "decay.yaml"
+    path.write_text("training: {weight_decay: 0.25, learning_rate: 0.02}\n")
+    options = ("--config", path, "--down-dims", 8, 16, "--points", 8, "--learning-rate", 0.03)
+    made = trained(told, demos, tmp_path / "out", *options)[1]
+    assert (made["preset"]["weight_decay"], made["preset"]["learning_rate"]) == (0.25, 0.03)
+
+
+def test_fields_of_a_distillation_have_their_former_names_for_one_release(told, demos, tmp_path):
+    trained(told, demos, tmp_path / "teacher", "--down-dims", 8, 16, "--points", 8)
+    path = tmp_path / "student.yaml"
+    path.write_text("training: {draws: 2, nfe: 2, ema_decay: 0.3}\n")
+    small = f"--steps 3 --warmup-steps 1 --batch-size 4 --device cpu --teacher {tmp_path / 'teacher'} --data {demos}"
+    former = ("--mu=0.5", "--skip", 20, "--config", path, "--set", "training.nfe=4")
+    status, _, err = told("distill", *small.split(), "--out", tmp_path / "student", *former)
+    assert status == 0, err
+    notices = [line for line in err.splitlines() if line.startswith("manicm-ms: warning: ")]
+    assert notices == [
+        "manicm-ms: warning: --mu is --ema-decay now; the former name goes with the next release",
+        "manicm-ms: warning: --skip is --solver-stride now; the former name goes with the next release",
+    ]
+    preset = read_manifest(tmp_path / "student")["provenance"]["preset"]
+    assert (preset["ema_decay"], preset["solver_stride"], preset["draws"], preset["nfe"]) == (0.5, 20, 2, 4)
+    head = json.loads((tmp_path / "student" / "config.json").read_text())["config"]["head"]
+    assert (head["name"], head["nfe"], head["num_solver_steps"]) == ("consistency", 4, 5)
 
 
 # ---- counts

@@ -9,7 +9,7 @@ from manicm_ms.cli import collecting, listing, main
 from manicm_ms.demos.expert_files import EXPERT_FILES
 from manicm_ms.demos.experts import EXPERTS
 from manicm_ms.envs.simulator import ENVS
-from manicm_ms.policies.base import POLICIES
+from manicm_ms.policies.methods import METHODS
 from manicm_ms.training.presets import TEACHER_PRESETS
 
 
@@ -32,7 +32,7 @@ def shown(monkeypatch):
 
 NAMES = {
     ("list", "envs"): ENVS.names,
-    ("list", "policies"): POLICIES.names,
+    ("list", "policies"): METHODS.names,
     ("list", "presets"): TEACHER_PRESETS.names,
     ("experts", "list"): EXPERT_FILES.names,
 }
@@ -69,15 +69,31 @@ def test_what_is_told_of_an_environment_is_the_same_in_any_width(shown):
 
 
 def test_every_policy_has_a_sentence_for_users(shown):
-    assert set(POLICIES.names()) == set(listing._POLICIES)
-    text = " ".join(shown(80, "list", "policies").split())
+    text, words = shown(400, "list", "policies"), " ".join(shown(80, "list", "policies").split())
     assert "Build" not in text
     assert "`" not in text
-    assert all(line in text for line in listing._POLICIES.values())
+    rows = {
+        cells[0]: cells for cells in ([c.strip() for c in line.split("│")[1:]] for line in text.splitlines()) if cells
+    }
+    for name in METHODS.names():
+        row = METHODS.get(name)
+        assert row.sentence.endswith(".")
+        assert row.reference
+        assert row.sentence in rows[name]
+        assert row.reference in rows[name]
+        assert row.sentence in words
+        assert row.reference in words
+
+
+def test_the_table_of_policies_names_the_parts_the_lengths_and_the_evaluations(shown):
+    lines = [[cell.strip() for cell in line.split("│")[1:-1]] for line in shown(400, "list", "policies").splitlines()]
+    rows = {cells[0]: cells[1:7] for cells in lines if cells}
+    assert rows["dp3"] == ["dp3", "unet1d", "diffusion", "averaged", "2, 4, 3", "10"]
+    assert rows["manicm"] == ["dp3", "unet1d", "consistency", "consistency", "2, 4, 3", "1"]
 
 
 def test_presets_say_what_leaving_a_field_out_means(shown):
     rows = {line.split("│")[1].strip(): line for line in shown(80, "list", "presets").splitlines() if "│" in line}
     assert "no clipping" in rows["clip_norm"]
     titles = [line.strip() for line in shown(80, "list", "presets").splitlines() if "presets" in line]
-    assert titles == ["teacher presets", "student presets"]
+    assert titles == ["training presets, as for simple_dp3", "student presets"]

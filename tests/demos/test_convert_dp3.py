@@ -13,14 +13,14 @@ from store_samples import SPEC
 from manicm_ms.cli import main
 from manicm_ms.demos.convert import import_store
 from manicm_ms.demos.store import DemoStore
-from manicm_ms.demos.survey import survey
+from manicm_ms.demos.summary import summarize
 from manicm_ms.envs.simulator import ENVS
 from manicm_ms.errors import ConfigError, OutputExistsError, SpecMismatchError, StoreError, UnknownNameError
 from manicm_ms.policies.checkpoint import load_checkpoint
 from manicm_ms.sensing.point_cloud import farthest_point_order
 from manicm_ms.spec import EnvSpec
 from manicm_ms.training.presets import TEACHER_PRESETS
-from manicm_ms.training.teacher import train_teacher
+from manicm_ms.training.train import train
 
 ENV_ID = "ur3e/slide-block"
 LENGTHS = (30, 41)
@@ -74,7 +74,7 @@ def test_a_store_of_a_registered_env(theirs, tmp_path):
             real, kept = given["data/point_cloud"][k, :550], store.point_cloud[k]
             np.testing.assert_array_equal(kept, real[farthest_point_order(real, 512)])
             assert_farthest_first(kept[:60])
-    assert survey(out).problems == []
+    assert summarize(out).problems == []
 
 
 def test_the_command_line_reads_it(theirs, tmp_path, capsys):
@@ -212,10 +212,10 @@ def test_a_policy_trains_on_it(theirs, tmp_path):
     import_store(theirs, "dp3", tmp_path / "ours.zarr", env=ENV_ID)
     with DemoStore.open(tmp_path / "ours.zarr", "a") as store:
         store.append(replace(store.episode(0), success=False))
-    small = {"batch_size": 8, "points": 16, "down_dims": (8, 16), "warmup_steps": 1}
-    preset = replace(TEACHER_PRESETS.get("quick"), steps=4, **small)
+    small = {"inputs": {"points": {"max_points": 16}}, "backbone": {"down_dims": (8, 16)}}
+    preset = replace(TEACHER_PRESETS.get("quick"), steps=4, batch_size=8, warmup_steps=1, changes=small)
     console = Console(file=io.StringIO(), width=200)
     ours = tmp_path / "ours.zarr"
-    checkpoint = train_teacher("simple_dp3", ours, tmp_path / "run", preset, device="cpu", console=console)
+    checkpoint = train("simple_dp3", ours, tmp_path / "run", preset, device="cpu", console=console)
     assert f"{ours}: 1 episode of 3 not solved, and learnt from all the same\n" in console.file.getvalue()
     assert load_checkpoint(checkpoint).spec.agent_pos_names == ENVS.get(ENV_ID).spec.agent_pos_names

@@ -19,7 +19,7 @@ from manicm_ms.demos.convert import import_store
 from manicm_ms.demos.convert.dp3 import Dp3Options, Reading
 from manicm_ms.demos.convert.raw_store import RawStore
 from manicm_ms.demos.store import DemoStore
-from manicm_ms.demos.survey import survey
+from manicm_ms.demos.summary import summarize
 from manicm_ms.errors import ConfigError, SpecMismatchError, StoreError
 
 CODINGS = {
@@ -373,7 +373,7 @@ def test_nothing_is_unpickled(tmp_path):
 def test_zipped_stores_and_files(tmp_path):
     source = write_dp3(tmp_path / "a.zarr")
     zipped = shutil.make_archive(str(source), "zip", source)
-    for open_it in (lambda p: import_store(p, "dp3", tmp_path / "o.zarr"), DemoStore.open, survey):
+    for open_it in (lambda p: import_store(p, "dp3", tmp_path / "o.zarr"), DemoStore.open, summarize):
         with pytest.raises(StoreError, match=r"is a zip file: unzip it \('python -m zipfile -e .*a.zarr'\)"):
             open_it(Path(zipped))
         (tmp_path / "file").write_text("mine")

@@ -14,7 +14,7 @@ from store_samples import PROVENANCE, SPEC, episode, make_store
 
 from manicm_ms.demos.inspect import inspect, pack_clouds
 from manicm_ms.demos.store import DemoStore
-from manicm_ms.demos.survey import survey
+from manicm_ms.demos.summary import summarize
 from manicm_ms.errors import StoreError
 
 SEEDS = (3, 1, 4, 15, 9, 2)
@@ -131,13 +131,13 @@ def test_many_damaged_episodes_are_counted(sound, tmp_path):
     path = tmp_path / "a.zarr"
     shutil.copytree(sound, path)
     set_value("data/point_cloud", slice(None), 0.0)(path)
-    named = [p for p in survey(path).problems if "empty cloud" in p]
+    named = [p for p in summarize(path).problems if "empty cloud" in p]
     assert len(named) == 6  # five episodes by name and the number of the rest
     assert "1 further" in named[-1]
 
 
 def test_empty_store_is_a_problem(tmp_path):
-    assert survey(make_store(tmp_path / "a.zarr")).problems == ["it holds no episode"]
+    assert summarize(make_store(tmp_path / "a.zarr")).problems == ["it holds no episode"]
 
 
 def remarks(path, capsys):

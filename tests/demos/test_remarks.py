@@ -7,8 +7,8 @@ import pytest
 from store_samples import PROVENANCE, SPEC, episode, make_store
 
 from manicm_ms.demos.remarks import field_remarks, length_remarks, store_remarks, training_remarks, window_remarks
+from manicm_ms.demos.sequence_dataset import SequenceDataset
 from manicm_ms.demos.store import DemoStore
-from manicm_ms.demos.windows import Windows
 from manicm_ms.spec import ChunkSpec
 
 RNG = np.random.default_rng(0)
@@ -116,13 +116,13 @@ def test_frames_that_no_window_reads(lengths, chunk, said):
 def test_a_store_that_is_learnt_from(tmp_path):
     sound = make_store(tmp_path / "a.zarr", (1, 2))
     with DemoStore.open(sound) as store:
-        assert store_remarks(store) == training_remarks(store, Windows.from_store(store, ChunkSpec())) == []
+        assert store_remarks(store) == training_remarks(store, SequenceDataset.from_store(store, ChunkSpec())) == []
     with DemoStore.create(tmp_path / "b.zarr", SPEC, PROVENANCE, extras=("image", "depth")) as store:
         for seed, length in ((0, 3), (1, 20)):
             given = episode(seed, length, success=seed > 0)
             given.point_cloud[0] = 0.25
             store.append(given)
-        remarks = training_remarks(store, Windows.from_store(store, ChunkSpec(2, 16, 8)))
+        remarks = training_remarks(store, SequenceDataset.from_store(store, ChunkSpec(2, 16, 8)))
     assert [r.partition(":")[0] for r in remarks] == [
         "not learnt from",
         "no decision is learnt at the last 7 frames of each episode",

@@ -17,7 +17,7 @@ from store_samples import PROVENANCE, SPEC, episode, make_store, require_same
 
 from manicm_ms.demos.layout import Episode
 from manicm_ms.demos.store import DemoStore
-from manicm_ms.demos.survey import survey
+from manicm_ms.demos.summary import summarize
 from manicm_ms.errors import NoSpaceError, OutputExistsError, StoreError
 from manicm_ms.paths import exclusive_lock
 
@@ -324,7 +324,7 @@ def test_lost_pictures_can_be_given_up(tmp_path):
         shutil.rmtree(path / "data" / name)
     with DemoStore.open(path) as store:
         require_same(store.episode(1), episode(SEEDS[1]))
-    assert survey(path).problems == []
+    assert summarize(path).problems == []
 
 
 def test_a_store_of_earlier_versions_is_extended(tmp_path):

@@ -7,7 +7,7 @@ import numpy as np
 import torch
 
 from manicm_ms.errors import ActionError, BackendError
-from manicm_ms.policies.base import Policy, starting_noise
+from manicm_ms.policies.policy import Policy, starting_noise
 from manicm_ms.spec import ActionSpec, ChunkSpec, EnvSpec, ObsSpec
 
 SPEC = EnvSpec(
@@ -135,12 +135,6 @@ class Proportional(Policy):
     @property
     def nfe(self):
         return 1
-
-    def config_dict(self):
-        return {"gain": self.gain.item(), "noise_scale": self.noise_scale}
-
-    def fit_normalizer(self, stats):
-        raise NotImplementedError("this policy needs no normaliser")
 
     def act(self, obs, *, generator=None, noise=None):
         position = obs["agent_pos"][:, -1]  # (B, 2)

@@ -8,20 +8,20 @@ from pathlib import Path
 import pytest
 from rich.console import Console
 
+from manicm_ms.envs.env_request import EnvRequest
 from manicm_ms.envs.simulator import ENVS
 from manicm_ms.errors import CheckpointError, ConfigError, SpecMismatchError, UnknownNameError
 from manicm_ms.evaluation.evaluate import evaluate
 from manicm_ms.evaluation.policies import checkpoint_digest, load_policies
 from manicm_ms.evaluation.protocol import Protocol
-from manicm_ms.evaluation.request import OBS_PRESET, request_of
-from manicm_ms.policies.base import make_policy
+from manicm_ms.evaluation.request import identity_of
 from manicm_ms.policies.checkpoint import save_checkpoint
-from manicm_ms.policies.manicm import ManiCM
+from manicm_ms.policies.methods import make_policy, student_of
 from manicm_ms.spec import ChunkSpec
 
 ENV = "ur3e/slide-block"
 SHIPPED = Path(__file__).parents[2] / "checkpoints" / "slide_block"
-CONFIG = {"network": {"down_dims": (16, 32, 48), "max_points": 64}}
+CONFIG = {"inputs": {"points": {"max_points": 64}}, "backbone": {"down_dims": (16, 32, 48)}}
 
 
 @pytest.fixture(scope="module")
@@ -29,7 +29,7 @@ def pair(tmp_path_factory):
     folder = tmp_path_factory.mktemp("pair")
     teacher = make_policy("simple_dp3", ENVS.get(ENV).spec, ChunkSpec(2, 4, 3), CONFIG, seed=0)
     save_checkpoint(teacher, folder / "teacher", {"data": {"env_id": ENV, "demo_seeds": [0, 7]}})
-    save_checkpoint(ManiCM.from_teacher(teacher), folder / "student", {})
+    save_checkpoint(student_of(teacher), folder / "student", {})
     return [folder / "teacher", folder / "student"]
 
 
@@ -83,7 +83,7 @@ def test_the_role_is_the_checkpoints_own(pair):
 def test_an_evaluation_that_an_earlier_version_began_goes_on(pair):
     def identified(checkpoints):
         protocol = Protocol(ENV, (5, 6), num_envs=1)
-        return request_of(protocol, load_policies(checkpoints), "cpu", "cpu", None, OBS_PRESET)
+        return identity_of(protocol, load_policies(checkpoints), EnvRequest(env_id=ENV, backend="cpu"), "cpu")
 
     teacher, student = (checkpoint_digest(str(path)) for path in pair)
     earlier = {"env_id": ENV, "seed": 5, "episodes": 2, "backend": "cpu", "device": "cpu"}

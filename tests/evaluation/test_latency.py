@@ -4,11 +4,12 @@ import time
 
 import pytest
 import torch
-from point_mass import CHUNK, SPEC, Proportional
+from point_mass import SPEC, Proportional
 
 from manicm_ms.errors import ConfigError
-from manicm_ms.evaluation.latency import example_observation, measure_latency
+from manicm_ms.evaluation.latency import measure_latency
 from manicm_ms.machine.devices import torch_threads
+from manicm_ms.policies import example_observations
 
 
 class Busy(Proportional):
@@ -60,11 +61,25 @@ def test_the_circumstances_travel_with_the_number():
     assert (measured.dtype, measured.device, measured.nfe) == ("float64", "cpu", 1)
 
 
-def test_the_example_observation_has_the_shapes_of_the_spec():
-    obs = example_observation(SPEC, CHUNK)
+def test_example_observations_have_the_shapes_of_the_spec():
+    policy = Proportional()
+    obs = example_observations(policy)
+    assert obs.keys() == {"point_cloud", "agent_pos"}
     assert obs["point_cloud"].shape == (1, 2, 4, 3)
     assert obs["agent_pos"].shape == (1, 2, 2)
-    assert torch.equal(obs["point_cloud"], example_observation(SPEC, CHUNK)["point_cloud"])
+    assert torch.equal(obs["point_cloud"], example_observations(policy)["point_cloud"])
+    assert not torch.equal(obs["point_cloud"], example_observations(policy, seed=1)["point_cloud"])
+    assert example_observations(policy, batch=5)["agent_pos"].shape == (5, 2, 2)
+
+
+def test_example_observations_are_of_what_the_policy_reads():
+    policy = Proportional()
+    policy.keys = ("agent_pos", "image")
+    obs = example_observations(policy, 3)
+    assert {key: tuple(value.shape) for key, value in obs.items()} == {
+        "agent_pos": (3, 2, 2),
+        "image": (3, 2, *SPEC.obs.image_size, 3),
+    }
 
 
 def test_senseless_counts_are_refused():

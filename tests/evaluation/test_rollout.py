@@ -13,9 +13,8 @@ from manicm_ms.errors import BackendError, ConfigError, SpecMismatchError
 from manicm_ms.evaluation.decisions import decision_noise
 from manicm_ms.evaluation.rollout import MAX_RESTARTS, EpisodeResult, RestartableEnv, rollout
 from manicm_ms.machine.devices import torch_threads
-from manicm_ms.policies.base import make_policy
 from manicm_ms.policies.finite import require_finite_actions
-from manicm_ms.policies.manicm import ManiCM
+from manicm_ms.policies.methods import make_policy, student_of
 from manicm_ms.spec import ActionSpec, ChunkSpec
 
 SEEDS = list(range(100, 123))
@@ -80,9 +79,12 @@ def test_noise_differs_between_seeds_and_decisions_and_not_between_policies():
 
 @pytest.mark.parametrize("nfe", [None, 4])
 def test_a_network_gives_the_same_bits_in_any_order_and_nearly_the_same_at_any_batch_size(nfe):
-    config = {"network": {"down_dims": (16, 32, 48), "state_widths": (16, 16), "point_widths": (16, 32, 32)}}
+    config = {
+        "encoder": {"state_widths": (16, 16), "point_widths": (16, 32, 32)},
+        "backbone": {"down_dims": (16, 32, 48)},
+    }
     policy = make_policy("simple_dp3", SPEC, CHUNK, config, seed=0)
-    policy = policy if nfe is None else ManiCM.from_teacher(policy, nfe=nfe)
+    policy = policy if nfe is None else student_of(policy, nfe=nfe)
     seeds = SEEDS[:6]
     with torch_threads(1):
         straight = rollout(PointMass(4), policy, seeds)

@@ -7,7 +7,7 @@ import pytest
 
 from manicm_ms.envs.vec_env import make_vec
 from manicm_ms.evaluation.rollout import RestartableEnv, rollout
-from manicm_ms.policies.base import make_policy
+from manicm_ms.policies.methods import make_policy
 from manicm_ms.spec import AGENT_POS, POINT_CLOUD, ChunkSpec
 
 CHUNK = ChunkSpec(n_obs_steps=2, horizon=4, n_action_steps=3)
@@ -22,7 +22,11 @@ def home():
 
 
 def test_a_killed_worker_costs_the_episodes_in_flight_and_no_other(home):
-    tiny = {"network": {"down_dims": (16, 32), "max_points": 64}, "diffusion": {"num_inference_steps": 1}}
+    tiny = {
+        "inputs": {"points": {"max_points": 64}},
+        "backbone": {"down_dims": (16, 32)},
+        "head": {"num_inference_steps": 1},
+    }
     policy = make_policy("simple_dp3", home.env.env_spec, CHUNK, tiny, seed=0)
     killed = []
 

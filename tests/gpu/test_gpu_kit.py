@@ -19,8 +19,8 @@ import run
 import torch
 from reach_demos import make_store
 
-from manicm_ms.policies.base import make_policy
 from manicm_ms.policies.checkpoint import load_checkpoint, read_manifest, save_checkpoint
+from manicm_ms.policies.methods import METHODS, make_policy
 from manicm_ms.training.interrupt import stop_requests
 from manicm_ms.training.presets import TEACHER_PRESETS
 from manicm_ms.training.run_folder import snapshot_folder
@@ -91,7 +91,7 @@ def test_the_parts_of_a_call_end_within_its_limit():
 def test_four_checkpoints_of_the_preset_may_come_back():
     names = {part_training.archive_name(task, kind) for task in part_training.TASKS for kind in part_training.SECONDS}
     assert len(names) + len({"results.jsonl", "log.txt"}) <= kit.FILES_BACK
-    chunk = TEACHER_PRESETS.get("paper").chunk
+    chunk = METHODS.get(part_training.POLICY).chunk_of("paper")
     policy = make_policy(part_training.POLICY, part_latency.door_spec(), chunk, seed=0)  # a larger hand than hammer's
     stored = 2 * sum(value.numel() for value in policy.state_dict().values())  # zip cannot be relied on to shrink it
     assert 14_000_000 < stored < kit.FILE_BACK_BYTES - 500_000
@@ -192,7 +192,7 @@ def test_the_floor_is_the_weights_that_a_decision_reads(latency_lines):
         for nfe in (1, 10)
     )
     policy = part_latency.policies(torch.device("cpu"), smoke=True)["DP3", "float32", 1]
-    unet = sum(p.numel() for p in policy.network.unet.parameters()) * 4 / 1e6
+    unet = sum(p.numel() for p in policy.head.backbone.parameters()) * 4 / 1e6
     assert ten["weights_mb"] - one["weights_mb"] == pytest.approx(9 * unet, abs=0.02)
 
 

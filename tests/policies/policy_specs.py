@@ -7,7 +7,10 @@ from torch import Tensor
 
 from manicm_ms.spec import ActionSpec, ChunkSpec, EnvSpec, ObsSpec
 
-TINY = {"network": {"down_dims": (16, 32), "n_groups": 4, "step_embed_dim": 16, "point_widths": (16, 32)}}
+TINY = {
+    "encoder": {"point_widths": (16, 32)},
+    "backbone": {"down_dims": (16, 32), "n_groups": 4, "step_embed_dim": 16},
+}
 """A network that acts in a millisecond."""
 
 CHUNK = ChunkSpec(n_obs_steps=2, horizon=4, n_action_steps=3)

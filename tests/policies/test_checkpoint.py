@@ -13,23 +13,25 @@ from safetensors.torch import load_file, save_file
 from manicm_ms.demos.stats import FieldStats
 from manicm_ms.errors import CheckpointError, ConfigError, OutputExistsError
 from manicm_ms.paths import set_aside, sha256
-from manicm_ms.policies.base import POLICIES, make_policy
+from manicm_ms.policies.backbones.unet1d import UNet1D
 from manicm_ms.policies.checkpoint import load_checkpoint, read_manifest, save_checkpoint
-from manicm_ms.policies.diffusion import OneStepTeacher
-from manicm_ms.policies.manicm import ManiCM
-from manicm_ms.policies.simple_dp3 import simple_dp3
+from manicm_ms.policies.configuration import merged
+from manicm_ms.policies.methods import make_policy, student_of
+from manicm_ms.policies.normalizer import Normalizer
 
 FILES = ("config.json", "model.safetensors", "MODEL_CARD.md")
 PROVENANCE = {"data": "data/slide_block.zarr", "preset": {"steps": 1500}, "seed": 3}
 
 
-def teacher(name="simple_dp3", seed=0, **network):
+TCP = {"cloud_frame": {"frame": "tcp"}}
+
+
+def teacher(name="simple_dp3", seed=0, **sections):
     spec = make_spec()
     sizes = {"point_cloud": 3, "agent_pos": 5, "action": 3}
     stats = {k: FieldStats(*(torch.full((n,), v).numpy() for v in (-0.7, 0.3, 0.0, 1.0))) for k, n in sizes.items()}
-    config = {"network": TINY["network"] | network}
-    policy = make_policy(name, spec, CHUNK, config, stats=stats, seed=seed)
-    wobble(policy.network.unet)
+    policy = make_policy(name, spec, CHUNK, merged(TINY, sections), stats=stats, seed=seed)
+    wobble(policy.head.backbone)
     return policy
 
 
@@ -48,16 +50,18 @@ def act(policy):
     [
         teacher,
         lambda: teacher("dp3"),
-        lambda: teacher(cloud_frame="tcp", max_points=16),
-        lambda: ManiCM.from_teacher(teacher()),
-        lambda: ManiCM.from_teacher(teacher("dp3", cloud_frame="tcp"), nfe=4),
+        lambda: teacher(inputs=TCP | {"points": {"max_points": 16}}),
+        lambda: student_of(teacher()),
+        lambda: student_of(teacher("dp3", inputs=TCP), nfe=4),
     ],
 )
 def test_what_is_loaded_acts_as_what_was_saved(tmp_path, make):
     policy = make()
     save_checkpoint(policy, tmp_path / "x", PROVENANCE)
     again = load_checkpoint(tmp_path / "x")
-    assert type(again) is type(policy)
+    for part in ("encoder", "head", "normalizer"):
+        assert type(getattr(again, part)) is type(getattr(policy, part))
+    assert type(again.head.backbone) is type(policy.head.backbone)
     assert (again.name, again.spec, again.chunk, again.nfe) == (policy.name, policy.spec, policy.chunk, policy.nfe)
     assert again.config_dict() == policy.config_dict()
     assert torch.equal(act(again), act(policy))
@@ -95,16 +99,19 @@ class Extras(torch.nn.Module):
 def test_half_precision_casts_floating_parameters_only(tmp_path, monkeypatch):
     """What a tensor is decides, not its name: a parameter of a normaliser is cast, a buffer elsewhere is not."""
 
-    def with_extras(config, spec, chunk):
-        policy = simple_dp3(config, spec, chunk)
-        policy.network.normalizer.extras, policy.network.unet.extras = Extras(), Extras()
-        return policy
+    def with_extras(init):
+        def longer(module, *arguments):
+            init(module, *arguments)
+            module.extras = Extras()
 
-    monkeypatch.setitem(POLICIES._entries, "simple_dp3", with_extras)
+        return longer
+
+    for kind in (Normalizer, UNet1D):
+        monkeypatch.setattr(kind, "__init__", with_extras(kind.__init__))
     policy = make_policy("simple_dp3", make_spec(), CHUNK, TINY, seed=0)
     save_checkpoint(policy, tmp_path / "x", {}, dtype="float16")
     again = load_checkpoint(tmp_path / "x")
-    for extras in (again.network.normalizer.extras, again.network.unet.extras):
+    for extras in (again.normalizer.extras, again.head.backbone.extras):
         assert extras.count.tolist() == [2**24 + 1, -3]
         assert extras.places.tolist() == [2**24 + 1]
         assert extras.mask.tolist() == [True, False]
@@ -113,9 +120,9 @@ def test_half_precision_casts_floating_parameters_only(tmp_path, monkeypatch):
         assert extras.weight.item() == 1.0
 
 
-@pytest.mark.parametrize("part", ["policy", "network.unet", "network.encoder.points"])
+@pytest.mark.parametrize("part", ["policy", "head.backbone", "encoder.points"])
 def test_a_compiled_policy_is_saved_as_what_it_wraps(tmp_path, part):
-    policy = ManiCM.from_teacher(teacher())
+    policy = student_of(teacher())
     expected = act(policy)
     save_checkpoint(policy, tmp_path / "plain", {}, dtype="float16")
     if part == "policy":
@@ -192,7 +199,7 @@ def change_manifest(folder, **changes):
     ("changes", "message"),
     [
         ({"format": "lerobot"}, "foreign"),
-        ({"version": 2}, "format version 2 and this package reads 1"),
+        ({"version": 3}, "format version 3 and this package reads 1 and 2"),
         ({"files": {}}, "does not list"),
         ({"files": {"../../etc/passwd": {}}}, "does not list"),
     ],
@@ -220,8 +227,9 @@ def sign(folder):
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        ({"policy": "octo"}, "unknown policy 'octo'"),
-        ({"config": {"network": {"colour": 1}}}, "no field colour"),
+        ({"config": {"encoder": {"name": "octo"}}}, "unknown encoder 'octo'"),
+        ({"config": {"encoder": {"name": "dp3", "colour": 1}}}, "unknown configuration key 'encoder.colour'"),
+        ({"config": {"network": {}}}, "unknown configuration key 'network'"),
         ({"chunk": {"n_obs_steps": 2, "horizon": 4, "n_action_steps": 4}}, "exceeds"),
         ({"chunk": {"n_obs_steps": 2, "horizon": "four", "n_action_steps": 3}}, "train it anew"),
         ({"env_spec": {}}, "train it anew"),
@@ -238,7 +246,7 @@ def test_a_configuration_that_this_version_cannot_build_is_refused(folder, chang
 
 
 def test_weights_of_another_network_are_refused(folder, tmp_path):
-    save_checkpoint(teacher(down_dims=(16, 48)), tmp_path / "other", {})
+    save_checkpoint(teacher(backbone={"down_dims": (16, 48)}), tmp_path / "other", {})
     shutil.copy(tmp_path / "other" / "model.safetensors", folder / "model.safetensors")
     sign(folder)
     with pytest.raises(CheckpointError, match=r"model\.safetensors does not fit"):
@@ -259,10 +267,10 @@ def test_a_pickle_in_place_of_the_weights_is_refused_and_not_run(folder, tmp_pat
 
 def test_a_lost_tensor_is_refused(folder):
     tensors = load_file(folder / "model.safetensors")
-    tensors.pop("network.normalizer.action_scale")
+    tensors.pop("normalizer.action_scale")
     save_file(tensors, folder / "model.safetensors")
     sign(folder)
-    with pytest.raises(CheckpointError, match=r"network\.normalizer\.action_scale"):
+    with pytest.raises(CheckpointError, match=r"normalizer\.action_scale"):
         load_checkpoint(folder)
 
 
@@ -282,12 +290,12 @@ def test_saving_again_replaces_a_checkpoint_but_nothing_else(folder, tmp_path):
 def test_what_cannot_be_saved_is_refused_and_the_old_checkpoint_stays(folder):
     diverged, large = teacher(), teacher()
     with torch.no_grad():
-        diverged.network.unet.head[1].weight[0, 0] = torch.nan
-        large.network.unet.head[1].weight[0, 0] = 1e6
+        diverged.head.backbone.head[1].weight[0, 0] = torch.nan
+        large.head.backbone.head[1].weight[0, 0] = 1e6
     for policy, dtype, error, message in (
         (diverged, "float32", CheckpointError, "diverged"),
         (large, "float16", CheckpointError, "overflows"),
-        (OneStepTeacher(teacher()), "float32", CheckpointError, "wrapper"),
+        (teacher().one_step(), "float32", CheckpointError, "shares the weights of another policy"),
         (teacher(), "float8", ConfigError, "float16"),
     ):
         with pytest.raises(error, match=message):

@@ -3,7 +3,7 @@ import torch
 from diffusers import DDIMScheduler
 
 from manicm_ms.errors import ConfigError
-from manicm_ms.policies.consistency import (
+from manicm_ms.policies.heads.consistency_solver import (
     CorrectedSolver,
     PublicSolver,
     boundary_scalings,
@@ -11,7 +11,7 @@ from manicm_ms.policies.consistency import (
     ddim_step,
     solver_timesteps,
 )
-from manicm_ms.policies.diffusion import DiffusionConfig, Guess, epsilon_from_x0
+from manicm_ms.policies.heads.diffusion import DiffusionConfig, Guess, epsilon_from_x0
 
 ABAR = DiffusionConfig().ddpm().alphas_cumprod
 

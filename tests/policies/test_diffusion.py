@@ -5,21 +5,16 @@ from policy_specs import CHUNK, TINY, make_obs, make_spec, wobble
 
 from manicm_ms.demos.stats import FieldStats
 from manicm_ms.errors import ConfigError
-from manicm_ms.policies.base import make_policy
-from manicm_ms.policies.consistency import CorrectedSolver
-from manicm_ms.policies.diffusion import (
-    PREDICTIONS,
-    DiffusionConfig,
-    OneStepTeacher,
-    epsilon_from_x0,
-    x0_from_epsilon,
-)
+from manicm_ms.policies.action_policy import ActionPolicy
+from manicm_ms.policies.heads.consistency_solver import CorrectedSolver
+from manicm_ms.policies.heads.diffusion import PREDICTIONS, DiffusionConfig, epsilon_from_x0, x0_from_epsilon
+from manicm_ms.policies.methods import make_policy
 
 
 def teacher(prediction_type="sample", seed=0, spec=None):
-    config = TINY | {"diffusion": {"prediction_type": prediction_type}}
+    config = TINY | {"head": {"prediction_type": prediction_type}}
     policy = make_policy("simple_dp3", spec or make_spec(), CHUNK, config, seed=seed)
-    wobble(policy.network.unet)
+    wobble(policy.head.backbone)
     return policy
 
 
@@ -36,7 +31,7 @@ def diffusers_process(**changes):
 def test_noising_is_diffusers():
     x0, epsilon, t = arrays()
     expected = diffusers_process().add_noise(x0, epsilon, t)
-    torch.testing.assert_close(teacher().add_noise(x0, epsilon, t), expected)
+    torch.testing.assert_close(teacher().head.add_noise(x0, epsilon, t), expected)
 
 
 def test_clean_action_and_noise_convert_into_each_other():
@@ -69,21 +64,21 @@ def test_conversion_equals_diffusers(prediction_type):
 @pytest.mark.parametrize("prediction_type", ["sample", "epsilon"])
 def test_the_trained_target_is_what_x0_is_read_from(prediction_type):
     x0, epsilon, t = arrays()
-    policy = teacher(prediction_type)
-    x_t = policy.add_noise(x0, epsilon, t)
-    perfect = policy.prediction.target(x0, epsilon)
-    got = policy.prediction.x0(perfect, x_t, policy.alphas_cumprod[t][:, None, None])
+    head = teacher(prediction_type).head
+    x_t = head.add_noise(x0, epsilon, t)
+    perfect = head.prediction.target(x0, epsilon)
+    got = head.prediction.x0(perfect, x_t, head.alphas_cumprod[t][:, None, None])
     torch.testing.assert_close(got, x0, rtol=1e-3, atol=1e-3)
 
 
-def ddim_by_hand(policy, cond, noise, steps):
+def ddim_by_hand(head, features, noise, steps):
     """DDIM written out: x0 clipped, epsilon implied by it, the last step ends at the clean action."""
     alpha_bar, stride = diffusers_process().alphas_cumprod.double(), 100 // steps
     x = noise.double()
     for t in range((steps - 1) * stride, -1, -stride):
         a, b = alpha_bar[t], alpha_bar[t - stride] if t >= stride else torch.tensor(1.0, dtype=torch.float64)
-        output = policy.network.denoise(x.float(), torch.full((len(x),), t), cond).double()
-        epsilon_predicted = policy.diffusion.prediction_type == "epsilon"
+        output = head.denoise(x.float(), torch.full((len(x),), t), features).double()
+        epsilon_predicted = head.config.prediction_type == "epsilon"
         x0 = ((x - (1 - a).sqrt() * output) / a.sqrt() if epsilon_predicted else output).clamp(-1, 1)
         # diffusers keeps the network's own epsilon after clipping x0
         epsilon = output if epsilon_predicted else (x - a.sqrt() * output) / (1 - a).sqrt()
@@ -95,17 +90,16 @@ def ddim_by_hand(policy, cond, noise, steps):
 @pytest.mark.parametrize("steps", [10, 5, 4])
 def test_sampling_is_ddim(prediction_type, steps):
     policy = teacher(prediction_type)
-    cond = policy.network.encode(make_obs(policy.spec, 5))
+    head, features = policy.head, policy.encode(make_obs(policy.spec, 5))
     noise = torch.randn(5, 4, 3, generator=torch.Generator().manual_seed(3))
     with torch.no_grad():
-        torch.testing.assert_close(
-            policy.sample(cond, noise, steps), ddim_by_hand(policy, cond, noise, steps), rtol=1e-4, atol=1e-4
-        )
+        got, expected = head.with_steps(steps).sample(features, noise), ddim_by_hand(head, features, noise, steps)
+    torch.testing.assert_close(got, expected, rtol=1e-4, atol=1e-4)
 
 
 def test_sampling_equals_diffusers_own_scheduler():
     policy = teacher()
-    cond = policy.network.encode(make_obs(policy.spec, 5))
+    features = policy.encode(make_obs(policy.spec, 5))
     noise = torch.randn(5, 4, 3, generator=torch.Generator().manual_seed(3))
     scheduler = DDIMScheduler(
         num_train_timesteps=100,
@@ -119,54 +113,55 @@ def test_sampling_equals_diffusers_own_scheduler():
     x = noise
     with torch.no_grad():
         for t in scheduler.timesteps:
-            x = scheduler.step(policy.network.denoise(x, t.repeat(5), cond), t, x).prev_sample
-        torch.testing.assert_close(policy.sample(cond, noise), x, rtol=0, atol=0)
+            x = scheduler.step(policy.head.denoise(x, t.repeat(5), features), t, x).prev_sample
+        torch.testing.assert_close(policy.head.sample(features, noise), x, rtol=0, atol=0)
 
 
 class Counted:
-    """Counts the calls of a network's `denoise`."""
+    """Notes the times of each call of a policy's network."""
 
-    def __init__(self, network):
-        self.times, self._denoise = [], network.denoise
-        network.denoise = self
+    def __init__(self, policy):
+        self.times = []
+        policy.head.backbone.register_forward_pre_hook(self.note)
 
-    def __call__(self, x_t, t, cond):
-        self.times.append(t.tolist())
-        return self._denoise(x_t, t, cond)
+    def note(self, module, inputs):
+        self.times.append([t.tolist() for t in inputs[1]])
 
 
 def test_nfe_is_the_number_of_network_calls():
     policy = teacher()
-    counted = Counted(policy.network)
+    counted = Counted(policy)
     policy.act(make_obs(policy.spec, 1))
     assert policy.nfe == len(counted.times) == 10
     counted.times.clear()
-    policy.act(make_obs(policy.spec, 1), num_inference_steps=4)
-    assert counted.times == [[75], [50], [25], [0]]
+    four = policy.with_head(policy.head.with_steps(4))
+    four.act(make_obs(policy.spec, 1))
+    assert four.nfe == 4
+    assert counted.times == [[[75]], [[50]], [[25]], [[0]]]
 
 
 def test_the_control_asks_the_teacher_once_at_its_last_time():
     policy = teacher()
-    counted, control = Counted(policy.network), OneStepTeacher(policy)
+    counted, control = Counted(policy), policy.one_step()
     obs, noise = make_obs(policy.spec, 2), torch.randn(2, 4, 3)
     action = control.act(obs, noise=noise)
     assert control.nfe == 1
-    assert counted.times == [[99, 99]]
+    assert counted.times == [[[99, 99]]]
     with torch.no_grad():
-        x0 = policy.network.denoise(noise, torch.tensor([99, 99]), policy.network.encode(obs))
+        x0 = policy.head.denoise(noise, torch.tensor([99, 99]), policy.encode(obs))
     torch.testing.assert_close(action, x0[:, 1:4].clamp(-1, 1))  # the identity normaliser
 
 
 def test_the_control_of_an_epsilon_teacher_reads_noise_where_the_sampler_begins():
     """At time 99 its error would be multiplied by 2029, and every action would lie on a limit."""
     policy = teacher("epsilon")
-    counted, control = Counted(policy.network), OneStepTeacher(policy)
+    counted, control = Counted(policy), policy.one_step()
     obs, noise = make_obs(policy.spec, 2), torch.randn(2, 4, 3)
     action = control.act(obs, noise=noise)
-    assert counted.times == [[90, 90]]
+    assert counted.times == [[[90, 90]]]
     a = diffusers_process().alphas_cumprod[90]
     with torch.no_grad():
-        output = policy.network.denoise(noise, torch.tensor([90, 90]), policy.network.encode(obs))
+        output = policy.head.denoise(noise, torch.tensor([90, 90]), policy.encode(obs))
     x0 = (noise - (1 - a).sqrt() * output) / a.sqrt()
     torch.testing.assert_close(action, x0[:, 1:4].clamp(-1, 1), rtol=1e-4, atol=1e-4)
 
@@ -176,7 +171,7 @@ def test_the_control_of_an_epsilon_teacher_reads_noise_where_the_sampler_begins(
 def test_the_distilled_path_is_the_sampled_path_where_clipping_acts(prediction_type, spacing):
     """Diffusers' DDIM step with the network's outputs, several times the limit: x0 is clipped, epsilon is not."""
     policy = teacher(prediction_type)
-    last = policy.network.unet.head[-1]
+    head, last = policy.head, policy.head.backbone.head[-1]
     with torch.no_grad():
         last.weight.mul_(4.0)
         last.bias.mul_(4.0)
@@ -189,16 +184,16 @@ def test_the_distilled_path_is_the_sampled_path_where_clipping_acts(prediction_t
         timestep_spacing=spacing,
     )
     scheduler.set_timesteps(10)
-    solver = CorrectedSolver(policy.alphas_cumprod, timestep_spacing=spacing)
-    cond = policy.network.encode(make_obs(policy.spec, 5))
+    solver = CorrectedSolver(head.alphas_cumprod, timestep_spacing=spacing)
+    features = policy.encode(make_obs(policy.spec, 5))
     x, beyond = torch.randn(5, 4, 3, generator=torch.Generator().manual_seed(3)), 0
     with torch.no_grad():
         for index in reversed(range(len(solver))):
             t = solver.timesteps[index].repeat(5)
-            output = policy.network.denoise(x, t, cond)
+            output = head.denoise(x, t, features)
             step = scheduler.step(output, int(t[0]), x)
             beyond += int((step.pred_original_sample.abs() == 1).sum())
-            got = solver.previous(policy.guess(x, t, cond), torch.full((5,), index))
+            got = solver.previous(head.guess(x, t, features), torch.full((5,), index))
             # from time 10 the leading grid goes to the clean action, diffusers to time 0
             expected = step.pred_original_sample if index == 0 else step.prev_sample
             torch.testing.assert_close(got, expected, rtol=1e-6, atol=1e-6)
@@ -206,7 +201,7 @@ def test_the_distilled_path_is_the_sampled_path_where_clipping_acts(prediction_t
     assert beyond > 20
 
 
-@pytest.mark.parametrize("wrap", [lambda p: p, OneStepTeacher])
+@pytest.mark.parametrize("wrap", [lambda p: p, ActionPolicy.one_step])
 def test_actions_follow_the_generator_and_the_noise(wrap):
     policy = wrap(teacher())
     obs = make_obs(policy.spec, 3)
@@ -234,7 +229,7 @@ def test_actions_are_the_executed_part_in_env_units_within_the_limits():
     policy, noise = teacher(spec=spec), torch.randn(64, 4, 3)
     obs = make_obs(spec, 64)
     with torch.no_grad():
-        chunk = policy.sample(policy.network.encode(obs), noise)
+        chunk = policy.head.sample(policy.encode(obs), noise)
 
     def ranges(size, low, high):
         return FieldStats(*(torch.full((size,), v).numpy() for v in (low, high, 0.0, 1.0)))

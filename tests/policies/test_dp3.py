@@ -3,7 +3,7 @@ import torch
 from policy_specs import CHUNK, TINY, adroit_door, make_obs, make_spec
 
 from manicm_ms.errors import ConfigError, SpecMismatchError, UnknownNameError
-from manicm_ms.policies.base import POLICIES, make_policy
+from manicm_ms.policies.methods import make_policy, methods_of
 
 
 def count(module):
@@ -17,14 +17,14 @@ def count(module):
 def test_parameter_counts_are_the_public_codes(name, total, unet):
     with torch.device("meta"):  # no memory is touched: a billion bytes for dp3 otherwise
         policy = make_policy(name, adroit_door(), CHUNK)
-    assert count(policy.network.unet) == unet
-    assert count(policy.network.encoder) == 64_832
+    assert count(policy.head.backbone) == unet
+    assert count(policy.encoder) == 64_832
     assert count(policy) == pytest.approx(total, rel=1e-3)
 
 
 @pytest.mark.parametrize("name", ["dp3", "simple_dp3"])
 def test_both_teachers_are_registered_and_rebuilt_from_their_configuration(name):
-    assert name in POLICIES.names("teacher")
+    assert name in methods_of("teacher")
     policy = make_policy(name, make_spec(), CHUNK, TINY, seed=0)
     again = make_policy(name, make_spec(), CHUNK, policy.config_dict(), seed=0)
     assert policy.config_dict() == again.config_dict()
@@ -43,18 +43,18 @@ def test_the_seed_decides_the_weights_and_leaves_the_default_generator_alone():
 
 
 @pytest.mark.parametrize(
-    ("config", "message"),
+    ("config", "error", "message"),
     [
-        ({"network": {"width": 3}}, "no field width"),
-        ({"unet": {}}, "no section unet"),
-        ({"network": {"down_dims": (100,)}}, "must divide every width"),
-        ({"network": {"kernel_size": 4}}, "odd"),
-        ({"network": {"down_dims": (16, 16, 16, 16)}}, "no multiple of 8"),
-        ({"diffusion": {"num_inference_steps": 101}}, "between 1 and"),
+        ({"backbone": {"width": 3}}, UnknownNameError, "unknown configuration key 'backbone.width'"),
+        ({"unet": {}}, UnknownNameError, "unknown configuration key 'unet'"),
+        ({"backbone": {"down_dims": (100,)}}, ConfigError, "must divide every width"),
+        ({"backbone": {"kernel_size": 4}}, ConfigError, "odd"),
+        ({"backbone": {"down_dims": (16, 16, 16, 16)}}, ConfigError, "no multiple of 8"),
+        ({"head": {"num_inference_steps": 101}}, ConfigError, "between 1 and"),
     ],
 )
-def test_a_configuration_that_cannot_be_is_refused(config, message):
-    with pytest.raises(ConfigError, match=message):
+def test_a_configuration_that_cannot_be_is_refused(config, error, message):
+    with pytest.raises(error, match=message):
         make_policy("simple_dp3", make_spec(), CHUNK, config)
 
 
@@ -62,7 +62,7 @@ def test_a_wrong_name_is_answered_with_the_nearest():
     with pytest.raises(UnknownNameError, match="did you mean 'simple_dp3'"):
         make_policy("simpel_dp3", make_spec(), CHUNK)
     with pytest.raises(UnknownNameError, match="did you mean 'epsilon'"):
-        make_policy("dp3", make_spec(), CHUNK, {"diffusion": {"prediction_type": "epsilom"}})
+        make_policy("dp3", make_spec(), CHUNK, {"head": {"prediction_type": "epsilom"}})
 
 
 @pytest.mark.parametrize("key", ["point_cloud", "agent_pos"])

@@ -1,8 +1,10 @@
 import pytest
 import torch
-from policy_specs import wobble
+from policy_specs import make_spec, wobble
 
-from manicm_ms.policies.encoders.point_net import DP3Encoder, PointNet
+from manicm_ms.policies.encoders.encoder import FeatureShape
+from manicm_ms.policies.encoders.point_net import DP3Encoder, DP3EncoderConfig, PointNet
+from manicm_ms.spec import ChunkSpec
 
 
 @pytest.fixture(params=[3, 6])
@@ -38,9 +40,11 @@ def test_maximum_equals_a_loop_over_points(encoder):
 
 
 def test_frames_are_encoded_apart_and_in_order():
-    net = DP3Encoder(3, 7, n_obs_steps=3, point_features=64, state_widths=(64, 64))
+    net = DP3Encoder(DP3EncoderConfig(), make_spec(agent_pos=7), ChunkSpec(3, 8, 2))
     g = torch.Generator().manual_seed(0)
     cloud, state = torch.randn(4, 3, 20, 3, generator=g), torch.randn(4, 3, 7, generator=g)
     parts = [torch.cat([net.points(cloud[:, i]), net.state(state[:, i])], -1) for i in range(3)]
-    assert net.out_features == 3 * 128
-    torch.testing.assert_close(net(cloud, state), torch.cat(parts, dim=-1))
+    assert net.shape == FeatureShape(cond=3 * 128, tokens=(3, 128))
+    cond, tokens = net({"point_cloud": cloud, "agent_pos": state})
+    torch.testing.assert_close(cond, torch.cat(parts, dim=-1))
+    torch.testing.assert_close(tokens, torch.stack(parts, dim=1))

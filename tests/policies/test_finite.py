@@ -8,10 +8,8 @@ import torch
 from policy_specs import CHUNK, TINY, make_obs, make_spec, wobble
 
 from manicm_ms.errors import NotFiniteError
-from manicm_ms.policies.base import make_policy
-from manicm_ms.policies.diffusion import OneStepTeacher
 from manicm_ms.policies.finite import finite_obs, require_finite_actions
-from manicm_ms.policies.manicm import ManiCM
+from manicm_ms.policies.methods import make_policy, student_of
 
 SPEC = make_spec(points=32)
 NAN, INF = float("nan"), float("inf")
@@ -19,11 +17,9 @@ NAN, INF = float("nan"), float("inf")
 
 @pytest.fixture(scope="module", params=["teacher", "control", "student"])
 def policy(request):
-    teacher = make_policy("simple_dp3", SPEC, CHUNK, {"network": TINY["network"] | {"max_points": 8}}, seed=0)
+    teacher = make_policy("simple_dp3", SPEC, CHUNK, TINY | {"inputs": {"points": {"max_points": 8}}}, seed=0)
     wobble(teacher)
-    return {"teacher": teacher, "control": OneStepTeacher(teacher), "student": ManiCM.from_teacher(teacher)}[
-        request.param
-    ]
+    return {"teacher": teacher, "control": teacher.one_step(), "student": student_of(teacher)}[request.param]
 
 
 def act(policy, obs):
@@ -90,7 +86,7 @@ def test_a_state_that_is_not_finite_is_refused_with_its_entries_and_rows(policy,
 @pytest.mark.parametrize("where", ["state", "noise", "weights"])
 def test_an_action_that_is_not_finite_is_refused(policy, where):
     obs, noise = make_obs(SPEC, 2), torch.randn(2, 4, 3)
-    bias = policy.network.unet.head[-1].bias
+    bias = policy.head.backbone.head[-1].bias
     kept = bias.detach().clone()
     if where == "state":
         obs = changed(obs, "agent_pos", (1, 0), 3e38)  # finite, and beyond what a matrix product holds

@@ -7,17 +7,15 @@ import torch
 from policy_specs import CHUNK, TINY, make_obs, make_spec, wobble
 
 from manicm_ms.errors import UnknownNameError
-from manicm_ms.policies.base import make_policy
 from manicm_ms.policies.checkpoint import load_checkpoint, save_checkpoint
-from manicm_ms.policies.diffusion import OneStepTeacher
-from manicm_ms.policies.manicm import ManiCM
-from manicm_ms.policies.points import POINT_CHOICES
+from manicm_ms.policies.encoders.points import POINT_CHOICES
+from manicm_ms.policies.methods import make_policy, student_of
 
 SPEC = make_spec(points=32)
 
 
-def teacher(**network):
-    policy = make_policy("simple_dp3", SPEC, CHUNK, {"network": TINY["network"] | {"max_points": 8} | network}, seed=0)
+def teacher(**points):
+    policy = make_policy("simple_dp3", SPEC, CHUNK, TINY | {"inputs": {"points": {"max_points": 8} | points}}, seed=0)
     wobble(policy)
     return policy
 
@@ -59,9 +57,9 @@ def test_a_row_s_points_depend_on_its_own_noise_alone():
 
 
 def players(points):
-    policy = teacher(acting_points=points)
-    student = ManiCM.from_teacher(policy, nfe=2)
-    return {"teacher": policy, "control": OneStepTeacher(policy), "student": student}
+    policy = teacher(acting=points)
+    student = student_of(policy, nfe=2)
+    return {"teacher": policy, "control": policy.one_step(), "student": student}
 
 
 @pytest.mark.parametrize("who", ["teacher", "control", "student"])
@@ -98,24 +96,24 @@ def test_random_points_are_the_ones_that_the_noise_says(who):
 
 def test_all_points_are_read_where_there_are_no_more():
     few = {k: v[:, :, :8] if k == "point_cloud" else v for k, v in make_obs(SPEC, 2).items()}
-    actions = [teacher(acting_points=points).act(few, noise=noise(2)) for points in ("prefix", "random")]
+    actions = [teacher(acting=points).act(few, noise=noise(2)) for points in ("prefix", "random")]
     assert torch.equal(*actions)
 
 
 def test_checkpoint_keeps_the_choice_and_an_older_one_acts_on_the_prefix(tmp_path):
     policy = teacher()
-    policy.network.act_on("random")
+    policy.transforms["points"].act_on("random")
     save_checkpoint(policy, tmp_path / "random", {})
-    assert load_checkpoint(tmp_path / "random").network.config.acting_points == "random"
+    assert load_checkpoint(tmp_path / "random").transforms["points"].config.acting == "random"
     described = json.loads((tmp_path / "random" / "config.json").read_text())["config"]
-    for name in ("acting_points", "training_points"):
-        described["network"].pop(name)
-    older = make_policy("simple_dp3", SPEC, CHUNK, described).network.config
-    assert (older.acting_points, older.training_points) == ("prefix", "random")
+    for name in ("acting", "training"):
+        described["inputs"]["points"].pop(name)
+    older = make_policy("simple_dp3", SPEC, CHUNK, described).transforms["points"].config
+    assert (older.acting, older.training) == ("prefix", "random")
 
 
 def test_unknown_choice_is_refused_with_the_known_ones():
     with pytest.raises(UnknownNameError, match="prefix"):
-        teacher(acting_points="prefx")
+        teacher(acting="prefx")
     with pytest.raises(UnknownNameError):
-        teacher().network.act_on("all")
+        teacher().transforms["points"].act_on("all")

@@ -24,12 +24,12 @@ def stores(tmp_path_factory):
 
 def test_the_windows_of_several_stores_follow_each_other_and_none_spans_two(stores):
     first, second, both = read_demos(stores[0], CHUNK), read_demos(stores[1], CHUNK), read_demos(stores, CHUNK)
-    n, frames = len(first.windows), len(first.windows.action)
-    assert len(both.windows) == n + len(second.windows)
-    for numbers, alone, offset in ((torch.arange(n), first, 0), (torch.arange(len(second.windows)), second, n)):
-        expected, found = alone.windows.batch(numbers), both.windows.batch(numbers + offset)
+    n, frames = len(first.dataset), len(first.dataset.action)
+    assert len(both.dataset) == n + len(second.dataset)
+    for numbers, alone, offset in ((torch.arange(n), first, 0), (torch.arange(len(second.dataset)), second, n)):
+        expected, found = alone.dataset.batch(numbers), both.dataset.batch(numbers + offset)
         assert all(torch.equal(expected[key], found[key]) for key in expected)
-    assert both.windows.index[:n].max() < frames <= both.windows.index[n:].min()
+    assert both.dataset.index[:n].max() < frames <= both.dataset.index[n:].min()
 
 
 def test_statistics_and_provenance_are_of_all_of_them(stores):

@@ -4,60 +4,37 @@ For actions N(0, SIGMA^2) the perfect network is a number for each time, so that
 each has the same path.
 """
 
-import copy
-
 import pytest
 import torch
-from reach_demos import reach_spec
-from torch import nn
+from toy_policies import TimeTable, exact_factors, toy_teacher
 
-from manicm_ms.policies.diffusion import DiffusionConfig, DiffusionPolicy, OneStepTeacher
-from manicm_ms.policies.manicm import ManiCM
-from manicm_ms.spec import ChunkSpec
-from manicm_ms.training.features import CLEAN_ACTION, COND
+from manicm_ms.policies.encoders.encoder import Features
+from manicm_ms.policies.methods import student_of
+from manicm_ms.training.features import CLEAN_ACTION
 from manicm_ms.training.objectives import ConsistencyDistillation
 
 SIGMA = 0.2  # small enough that the exact x0 is seldom clipped
 KINDS = ("sample", "epsilon")
 
 
-class TimeTable(nn.Module):
-    """A denoiser that multiplies x_t by a number looked up at t."""
-
-    def __init__(self, factors):
-        super().__init__()
-        self.factors = nn.Parameter(factors.float())
-        self.encoder = nn.Identity()
-
-    def denoise(self, x_t, t, cond):
-        return self.factors[t][:, None, None] * x_t
-
-
 def exact_teacher(kind):
     """Return the teacher E[x0 | x_t], or E[epsilon | x_t], of the Gaussian."""
-    diffusion = DiffusionConfig(prediction_type=kind)
-    abar = diffusion.ddpm().alphas_cumprod.double()
-    x0 = abar.sqrt() * SIGMA**2 / (abar * SIGMA**2 + 1 - abar)
-    factors = x0 if kind == "sample" else (1 - abar.sqrt() * x0) / (1 - abar).sqrt()
-    return DiffusionPolicy(kind, TimeTable(factors), reach_spec(action_names=("a",)), ChunkSpec(1, 1, 1), diffusion)
+    return toy_teacher(TimeTable(exact_factors(SIGMA, kind)), kind)
 
 
 def objective_of(kind, error=0.0):
     """Return the distillation of the exact teacher; the student's factors are off by random numbers of size `error`."""
     teacher = exact_teacher(kind)
-    student = ManiCM(
-        copy.deepcopy(teacher.network), teacher.spec, teacher.chunk, teacher.diffusion,
-        ManiCM.from_teacher(teacher).consistency,
-    )  # fmt: skip
+    student = student_of(teacher)
     off = error * torch.randn(100, generator=torch.Generator().manual_seed(0))
     with torch.no_grad():
-        student.network.factors += off
-    return ConsistencyDistillation(teacher, student, mu=0.95)
+        student.head.backbone.factors += off
+    return ConsistencyDistillation(teacher, student, ema_decay=0.95)
 
 
 def batch(rows, seed=0):
     x0 = SIGMA * torch.randn(rows, 1, 1, generator=torch.Generator().manual_seed(seed))
-    return {CLEAN_ACTION: x0, COND: torch.zeros(rows, 1, 1)}
+    return {CLEAN_ACTION: x0, "cond": torch.zeros(rows, 1, 1)}
 
 
 def loss_of(objective):
@@ -77,12 +54,12 @@ def test_the_gradient_of_an_epsilon_student_is_of_the_order_of_the_other_s():
     for kind in KINDS:
         objective = objective_of(kind, error=0.05)
         loss_of(objective).backward()
-        norms[kind] = float(objective.student.network.factors.grad.norm())
+        norms[kind] = float(objective.student.head.backbone.factors.grad.norm())
     assert norms["epsilon"] < 30 * norms["sample"]
 
 
 def played(policy, noise):
-    return policy.sample(None, noise) if isinstance(policy, DiffusionPolicy) else policy.sample(None, (noise,))
+    return policy.head.act(Features(torch.zeros(len(noise), 1)), (noise,), None)[0]
 
 
 @pytest.mark.parametrize("kind", KINDS)
@@ -104,8 +81,6 @@ def test_one_step_of_an_epsilon_teacher_is_its_guess_and_not_a_limit():
     teacher = exact_teacher("epsilon")
     noise = torch.randn(1000, 1, 1, generator=torch.Generator().manual_seed(2))
     obs = {"point_cloud": torch.zeros(1000, 1, 64, 3), "agent_pos": torch.zeros(1000, 1, 4)}
-    teacher.network.encode_acting = lambda obs, noise: None
-    teacher.network.normalizer = type("Same", (), {"unnormalize": staticmethod(lambda field, value: value)})()
-    action = OneStepTeacher(teacher).act(obs, noise=noise)
-    a = teacher.alphas_cumprod[90]
+    action = teacher.one_step().act(obs, noise=noise)
+    a = teacher.head.alphas_cumprod[90]
     torch.testing.assert_close(action, a.sqrt() * SIGMA**2 / (a * SIGMA**2 + 1 - a) * noise, rtol=1e-3, atol=1e-4)

@@ -72,12 +72,12 @@ def test_power_average_equals_that_of_diffusers():
 def test_constant_average_is_a_geometric_sum():
     module = nn.Linear(1, 1, bias=False)
     start = module.weight.item()
-    ours, mu = averaged(module, ConstantDecay(0.95)), 0.95
+    ours, kept = averaged(module, ConstantDecay(0.95)), 0.95
     visited = []
     for _ in walk(module, 12):
         ours.update_parameters(module)
         visited.append(module.weight.item())
-    expected = mu**12 * start + (1 - mu) * sum(mu ** (11 - k) * visited[k] for k in range(12))
+    expected = kept**12 * start + (1 - kept) * sum(kept ** (11 - k) * visited[k] for k in range(12))
     assert ours.module.weight.item() == pytest.approx(expected, rel=1e-5)
 
 

@@ -20,13 +20,14 @@ from manicm_ms.errors import (
     UnknownNameError,
 )
 from manicm_ms.policies.checkpoint import load_checkpoint, read_manifest
+from manicm_ms.training.distill import distill
 from manicm_ms.training.presets import STUDENT_PRESETS, TEACHER_PRESETS
-from manicm_ms.training.student import distill
-from manicm_ms.training.teacher import train_teacher
+from manicm_ms.training.train import train
 
 TEACHER = replace(
-    TEACHER_PRESETS.get("quick"), steps=250, batch_size=32, points=32, down_dims=(16, 32), warmup_steps=20
-)
+    TEACHER_PRESETS.get("quick"), steps=250, batch_size=32, warmup_steps=20,
+    changes={"inputs": {"points": {"max_points": 32}}, "backbone": {"down_dims": (16, 32)}},
+)  # fmt: skip
 STUDENT = replace(STUDENT_PRESETS.get("quick"), steps=40, batch_size=32, warmup_steps=5)
 FEW = {"steps": 4, "warmup_steps": 1}
 
@@ -43,7 +44,7 @@ def pair(tmp_path_factory):
     """Return folder, data, teacher and student of one small but real training."""
     folder = tmp_path_factory.mktemp("pair")
     data = make_store(folder / "reach.zarr", episodes=20)
-    teacher, _ = run(train_teacher, "simple_dp3", data, folder / "teacher", TEACHER)
+    teacher, _ = run(train, "simple_dp3", data, folder / "teacher", TEACHER)
     student, _ = run(distill, teacher, data, folder / "student", STUDENT)
     return folder, data, teacher, student
 
@@ -75,9 +76,10 @@ def test_it_learns_the_motion(pair, which):
 def test_student_is_one_network_evaluation_and_keeps_the_encoder(pair):
     teacher, student = load_checkpoint(pair[2]), load_checkpoint(pair[3])
     assert (teacher.nfe, student.nfe) == (10, 1)
-    weights, frozen = teacher.network.state_dict(), student.network.state_dict()
+    weights, frozen = teacher.state_dict(), student.state_dict()
     assert all(torch.equal(weights[k], frozen[k]) for k in weights if k.startswith(("encoder", "normalizer")))
-    assert any(not torch.equal(weights[k], frozen[k]) for k in weights if k.startswith("unet"))
+    assert any(not torch.equal(weights[k], frozen[k]) for k in weights if k.startswith("head.backbone"))
+    assert weights.keys() == frozen.keys()
 
 
 def test_checkpoint_says_where_it_comes_from(pair):
@@ -87,7 +89,7 @@ def test_checkpoint_says_where_it_comes_from(pair):
     assert (made["data"]["episodes"], made["data"]["frames"]) == (20, 240)
     assert made["data"]["collection"] == {"expert": "straight"}
     assert (made["steps"], made["seed"], made["precision"]) == (250, 0, "32-true")
-    assert made["preset"]["down_dims"] == [16, 32]
+    assert made["preset"]["changes"]["backbone"]["down_dims"] == [16, 32]
     assert made["seconds"] > 0
     assert 0 < made["final_loss"] < 1
     taught = read_manifest(student)["provenance"]["teacher"]
@@ -110,7 +112,7 @@ def test_checkpoints_hold_the_seeds_of_their_demonstrations(pair, tmp_path):
 def test_finished_run_returns_at_once_and_leaves_no_state(pair):
     folder, data, teacher, student = pair
     before = {p: p.stat().st_mtime_ns for f in (teacher, student) for p in f.iterdir()}
-    assert "finished" in run(train_teacher, "simple_dp3", data, teacher, TEACHER)[1]
+    assert "finished" in run(train, "simple_dp3", data, teacher, TEACHER)[1]
     assert "finished" in run(distill, teacher, data, student, STUDENT)[1]
     assert {p: p.stat().st_mtime_ns for p in before} == before
     assert sorted(p.name for p in (folder / "teacher.train").iterdir()) == [
@@ -121,7 +123,7 @@ def test_finished_run_returns_at_once_and_leaves_no_state(pair):
 def test_same_seed_same_weights_and_another_seed_others(pair, tmp_path):
     hashes = []
     for name, seed in (("a", 0), ("b", 0), ("c", 1)):
-        out, _ = run(train_teacher, "simple_dp3", pair[1], tmp_path / name, replace(TEACHER, **FEW), seed=seed)
+        out, _ = run(train, "simple_dp3", pair[1], tmp_path / name, replace(TEACHER, **FEW), seed=seed)
         hashes.append(read_manifest(out)["files"]["model.safetensors"]["sha256"])
     assert hashes[0] == hashes[1] != hashes[2]
 
@@ -129,7 +131,7 @@ def test_same_seed_same_weights_and_another_seed_others(pair, tmp_path):
 def test_another_run_is_refused_with_the_difference(pair):
     _, data, teacher, _ = pair
     with pytest.raises(OutputExistsError, match=r"another run \(preset.learning_rate 0.001 there, 0.01 now\)"):
-        run(train_teacher, "simple_dp3", data, teacher, replace(TEACHER, learning_rate=0.01))
+        run(train, "simple_dp3", data, teacher, replace(TEACHER, learning_rate=0.01))
     with pytest.raises(OutputExistsError, match="another run"):
         run(distill, teacher, data, teacher, STUDENT)
 
@@ -139,7 +141,7 @@ def test_a_folder_that_is_not_ours_is_refused_untouched(pair, tmp_path):
     out.mkdir()
     (out / "chapter1.txt").write_text("years of work")
     with pytest.raises(OutputExistsError, match="something else"):
-        run(train_teacher, "simple_dp3", pair[1], out, TEACHER)
+        run(train, "simple_dp3", pair[1], out, TEACHER)
     assert (out / "chapter1.txt").read_text() == "years of work"
     assert [p.name for p in tmp_path.iterdir()] == ["thesis"]
 
@@ -160,20 +162,20 @@ def test_a_student_is_not_a_teacher(pair, tmp_path):
     ("policy", "data", "error", "match"),
     [
         ("simple_dp", None, UnknownNameError, "did you mean 'simple_dp3'"),
-        ("manicm", None, UnknownNameError, "known: dp3, simple_dp3"),
+        ("manicm", None, ConfigError, "manicm learns from a teacher, not from demonstrations: use manicm-ms distill"),
         ("simple_dp3", Path("/nowhere.zarr"), StoreError, "nowhere"),
     ],
 )
 def test_bad_input_is_named(pair, tmp_path, policy, data, error, match):
     with pytest.raises(error, match=match):
-        run(train_teacher, policy, data or pair[1], tmp_path / "out", TEACHER)
+        run(train, policy, data or pair[1], tmp_path / "out", TEACHER)
     assert not any(tmp_path.iterdir())
 
 
 def test_a_negative_seed_is_refused_before_anything_is_made(pair, tmp_path):
-    for train, *inputs, preset in ((train_teacher, "simple_dp3", pair[1], TEACHER), (distill, *pair[2:0:-1], STUDENT)):
+    for function, *inputs, preset in ((train, "simple_dp3", pair[1], TEACHER), (distill, *pair[2:0:-1], STUDENT)):
         with pytest.raises(ConfigError, match="seed must not be negative, got -1"):
-            run(train, *inputs, tmp_path / "out", preset, seed=-1)
+            run(function, *inputs, tmp_path / "out", preset, seed=-1)
     assert not any(tmp_path.iterdir())
 
 
@@ -181,13 +183,13 @@ def test_a_state_left_by_a_kill_after_the_checkpoint_is_removed(pair):
     folder, data, teacher, _ = pair
     state = folder / "teacher.train" / "state.safetensors"
     state.write_bytes(b"left behind")
-    assert "finished" in run(train_teacher, "simple_dp3", data, teacher, TEACHER)[1]
+    assert "finished" in run(train, "simple_dp3", data, teacher, TEACHER)[1]
     assert not state.exists()
 
 
-def test_skip_must_divide_the_timesteps(pair, tmp_path):
-    with pytest.raises(ConfigError, match="skip=7 must divide"):
-        run(distill, pair[2], pair[1], tmp_path / "out", replace(STUDENT, skip=7))
+def test_the_solvers_stride_must_divide_the_timesteps(pair, tmp_path):
+    with pytest.raises(ConfigError, match="solver_stride=7 must divide"):
+        run(distill, pair[2], pair[1], tmp_path / "out", replace(STUDENT, solver_stride=7))
 
 
 @pytest.mark.parametrize(
@@ -197,7 +199,7 @@ def test_skip_must_divide_the_timesteps(pair, tmp_path):
 )  # fmt: skip
 def test_devices_that_cannot_share_a_batch_are_refused_before_any_process_starts(pair, tmp_path, num_devices, match):
     with pytest.raises(ConfigError, match=match):
-        run(train_teacher, "simple_dp3", pair[1], tmp_path / "t", TEACHER, num_devices=num_devices)
+        run(train, "simple_dp3", pair[1], tmp_path / "t", TEACHER, num_devices=num_devices)
     with pytest.raises(ConfigError, match=match):
         run(distill, pair[2], pair[1], tmp_path / "s", STUDENT, num_devices=num_devices)
     assert list(tmp_path.iterdir()) == []
@@ -214,10 +216,9 @@ def test_a_teacher_is_distilled_on_its_own_tasks_data_unless_another_is_meant(pa
 
 def test_epsilon_prediction_and_the_public_formula_train_too(pair, tmp_path):
     _, data, *_ = pair
-    out, _ = run(
-        train_teacher, "simple_dp3", data, tmp_path / "eps", replace(TEACHER, **FEW, prediction_type="epsilon")
-    )
-    assert json.loads((out / "config.json").read_text())["config"]["diffusion"]["prediction_type"] == "epsilon"
+    preset = replace(TEACHER, **FEW).with_changes({"head": {"prediction_type": "epsilon"}})
+    out, _ = run(train, "simple_dp3", data, tmp_path / "eps", preset)
+    assert json.loads((out / "config.json").read_text())["config"]["head"]["prediction_type"] == "epsilon"
     for objective in ("consistency", "public-consistency"):
         student, _ = run(distill, out, data, tmp_path / objective, replace(STUDENT, **FEW, objective=objective))
         obs, _ = unseen_cases(2)
@@ -228,7 +229,7 @@ def test_epsilon_prediction_and_the_public_formula_train_too(pair, tmp_path):
 @pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a CUDA device")
 def test_cuda_trains_and_the_checkpoint_acts_on_a_cpu(pair, tmp_path):
     quiet = {"device": "cuda", "precision": "bf16-mixed", "console": Console(file=io.StringIO())}
-    teacher = train_teacher("simple_dp3", pair[1], tmp_path / "teacher", TEACHER, **quiet)
+    teacher = train("simple_dp3", pair[1], tmp_path / "teacher", TEACHER, **quiet)
     student = distill(teacher, pair[1], tmp_path / "student", STUDENT, **quiet)
     obs, expected = unseen_cases()
     chosen = load_checkpoint(student).act(obs)[:, 0]

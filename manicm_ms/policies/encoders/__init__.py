@@ -1,1 +1,1 @@
-"""Observation encoders: point clouds and proprioception to feature vectors."""
+"""Observation encoders, and the transforms that stand before them; a file in here that registers one is found."""

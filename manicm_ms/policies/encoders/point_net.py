@@ -3,10 +3,15 @@
 from __future__ import annotations
 
 import itertools
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 
 import torch
 from torch import Tensor, nn
+
+from manicm_ms.errors import ConfigError, require_at_least
+from manicm_ms.policies.encoders.encoder import ENCODERS, Features, FeatureShape, ObsEncoder
+from manicm_ms.spec import AGENT_POS, POINT_CLOUD, ChunkSpec, EnvSpec
 
 
 class PointNet(nn.Module):
@@ -36,38 +41,61 @@ class PointNet(nn.Module):
         return self.projection(self.point_mlp(cloud).max(dim=1).values)
 
 
-class DP3Encoder(nn.Module):
-    """Encodes To frames into one conditioning vector: per frame the cloud's features, then proprioception's.
+@dataclass(frozen=True)
+class DP3EncoderConfig:
+    """Widths of DP3's encoder.
 
-    Args:
-        point_channels: C.
-        agent_pos_dim: D.
-        n_obs_steps: To.
+    Attributes:
         point_widths: of the per-point MLP.
-        point_features: of each frame's cloud.
-        state_widths: of the proprioception MLP; the last one is its output.
+        point_features: of a cloud.
+        state_widths: of the proprioception MLP, the last one its features.
     """
 
-    def __init__(
-        self,
-        point_channels: int,
-        agent_pos_dim: int,
-        n_obs_steps: int,
-        point_widths: Sequence[int] = (64, 128, 256),
-        point_features: int = 64,
-        state_widths: Sequence[int] = (64, 64),
-    ) -> None:
-        super().__init__()
-        self.points = PointNet(point_channels, point_widths, point_features)
+    point_widths: tuple[int, ...] = (64, 128, 256)
+    point_features: int = 64
+    state_widths: tuple[int, ...] = (64, 64)
+
+    def __post_init__(self) -> None:
+        if not self.point_widths or not self.state_widths:
+            raise ConfigError("point_widths and state_widths need a layer each")
+        require_at_least(
+            1,
+            point_widths=min(self.point_widths),
+            point_features=self.point_features,
+            state_widths=min(self.state_widths),
+        )
+
+
+@ENCODERS.register("dp3")
+class DP3Encoder(ObsEncoder):
+    """Encodes To frames: per frame the cloud's features, then proprioception's.
+
+    The vector of a row is that of its frames one after another, and its tokens are the frames'.
+
+    Args:
+        config: widths.
+        spec: the environment that it is made for.
+        chunk: To, Tp, Ta.
+    """
+
+    Config = DP3EncoderConfig
+    keys = (POINT_CLOUD, AGENT_POS)
+
+    def __init__(self, config: DP3EncoderConfig, spec: EnvSpec, chunk: ChunkSpec) -> None:
+        super().__init__(config, spec, chunk)
+        self.points = PointNet(spec.obs.point_channels, config.point_widths, config.point_features)
         layers: list[nn.Module] = []
-        for fan_in, fan_out in itertools.pairwise((agent_pos_dim, *state_widths)):
+        for fan_in, fan_out in itertools.pairwise((spec.obs.agent_pos_dim, *config.state_widths)):
             layers += [nn.Linear(fan_in, fan_out), nn.ReLU()]
         self.state = nn.Sequential(*layers[:-1])  # no activation after the last layer
-        self.out_features = n_obs_steps * (point_features + state_widths[-1])
+        width = config.point_features + config.state_widths[-1]
+        self.shape = FeatureShape(chunk.n_obs_steps * width, (chunk.n_obs_steps, width))
 
-    def forward(self, cloud: Tensor, agent_pos: Tensor) -> Tensor:
-        """Return (B, out_features) for normalised clouds (B, To, P, C) and proprioception (B, To, D)."""
-        batch = cloud.shape[0]
+    def forward(self, obs: Mapping[str, Tensor]) -> Features:
+        """Return the features of normalised clouds (B, To, P, C) and proprioception (B, To, D)."""
+        cloud, agent_pos = obs[POINT_CLOUD], obs[AGENT_POS]
         cloud_features = self.points(cloud.flatten(0, 1))  # (B To, F)
         state_features = self.state(agent_pos.flatten(0, 1))  # (B To, F')
-        return torch.cat([cloud_features, state_features], dim=-1).reshape(batch, self.out_features)
+        frames = torch.cat([cloud_features, state_features], dim=-1)
+        tokens = frames.unflatten(0, cloud.shape[:2])  # (B, To, F + F')
+        return Features(tokens.flatten(1), tokens)

@@ -14,7 +14,7 @@ import torch
 from torch import Tensor
 
 from manicm_ms.errors import ConfigError
-from manicm_ms.policies.diffusion import Guess
+from manicm_ms.policies.heads.diffusion import Guess
 from manicm_ms.registry import Registry
 
 Denoise = Callable[[Tensor, Tensor], Tensor]

@@ -17,7 +17,7 @@ if TYPE_CHECKING:
     from manicm_ms.demos.store import DemoStore
 
 
-def window_index(episode_ends: np.ndarray, chunk: ChunkSpec) -> np.ndarray:
+def sequence_index(episode_ends: np.ndarray, chunk: ChunkSpec) -> np.ndarray:
     """Return which frames each window holds.
 
     A window spans Tp consecutive frames and may begin up to To - 1 frames before its episode or end up to
@@ -48,14 +48,14 @@ def window_index(episode_ends: np.ndarray, chunk: ChunkSpec) -> np.ndarray:
 
 
 @dataclass(frozen=True)
-class Windows:
+class SequenceDataset:
     """All windows of a demonstration store, as tensors on one device.
 
     Attributes:
         point_cloud: (F, P, C) float32, metres (and colours), frames of all episodes one after another.
         agent_pos: (F, D) float32.
         action: (F, Da) float32, normalised to [-1, 1].
-        index: (N, Tp) int64, frames of each window; see `window_index`.
+        index: (N, Tp) int64, frames of each window; see `sequence_index`.
         chunk: To, Tp, Ta.
     """
 
@@ -83,25 +83,25 @@ class Windows:
         action: np.ndarray,
         episode_ends: np.ndarray,
         chunk: ChunkSpec,
-    ) -> Windows:
+    ) -> SequenceDataset:
         """Copy arrays of F frames (shapes as the attributes') into tensors and index their windows."""
         return cls(
             point_cloud=torch.tensor(np.asarray(point_cloud), dtype=torch.float32),
             agent_pos=torch.tensor(np.asarray(agent_pos), dtype=torch.float32),
             action=torch.tensor(np.asarray(action), dtype=torch.float32),
-            index=torch.from_numpy(window_index(episode_ends, chunk)),
+            index=torch.from_numpy(sequence_index(episode_ends, chunk)),
             chunk=chunk,
         )
 
     @classmethod
-    def from_store(cls, store: DemoStore, chunk: ChunkSpec) -> Windows:
+    def from_store(cls, store: DemoStore, chunk: ChunkSpec) -> SequenceDataset:
         """Read every committed frame of `store` and index its windows."""
         ends = np.asarray(store.episode_ends)
         frames = int(ends[-1]) if len(ends) else 0
         return cls.from_arrays(store.point_cloud[:frames], store.state[:frames], store.action[:frames], ends, chunk)
 
     @classmethod
-    def joined(cls, parts: Sequence[Windows]) -> Windows:
+    def joined(cls, parts: Sequence[SequenceDataset]) -> SequenceDataset:
         """Return the windows of several stores as those of one: frames one after another, no window across stores."""
         starts = np.cumsum([0, *(len(part.action) for part in parts)]).tolist()
         fields = {name: torch.cat([getattr(part, name) for part in parts]) for name in (POINT_CLOUD, AGENT_POS, ACTION)}
@@ -112,7 +112,7 @@ class Windows:
         """Return N, the number of windows."""
         return len(self.index)
 
-    def to(self, device: torch.device | str) -> Windows:
+    def to(self, device: torch.device | str) -> SequenceDataset:
         """Return the same windows with all tensors on `device`."""
         moved = {name: getattr(self, name).to(device) for name in ("point_cloud", "agent_pos", "action", "index")}
         return replace(self, **moved)

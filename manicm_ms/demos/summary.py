@@ -1,4 +1,4 @@
-"""Surveying a store: what it holds and what is wrong with it, however broken it is.
+"""The summary of a store: what it holds and what is wrong with it, however broken it is.
 
 Reads the zarr arrays one by one instead of through `DemoStore`, which refuses a damaged store as a whole.
 """
@@ -36,7 +36,7 @@ _MOST_NAMED = 5  # problems of one kind that are spelled out
 
 
 @dataclass
-class Survey:
+class Summary:
     """What a store holds; its fields are the keys of `manicm-ms inspect --json`.
 
     Attributes:
@@ -80,18 +80,18 @@ class Survey:
         return asdict(self)
 
 
-class _Surveyor:
-    """Fills a `Survey` step by step; every step goes on as far as the damage lets it."""
+class _Summarizer:
+    """Fills a `Summary` step by step; every step goes on as far as the damage lets it."""
 
     def __init__(self, path: Path) -> None:
         self.path = path
-        self.result = Survey(str(path))
+        self.result = Summary(str(path))
         self.spec: EnvSpec | None = None
         self.ends = np.zeros(0, np.int64)
         self.all_written = False
         self.missing: list[str] = []
 
-    def run(self) -> Survey:
+    def run(self) -> Summary:
         """Look at everything and return what was found."""
         self.result.bytes_on_disk = sum(f.stat().st_size for f in self.path.rglob("*") if f.is_file())
         self._attributes()
@@ -253,10 +253,10 @@ class _Surveyor:
         return values
 
 
-def survey(path: Path) -> Survey:
+def summarize(path: Path) -> Summary:
     """Return what the store at `path` holds, with its problems named.
 
-    Raises StoreError only where no zarr group stands at `path`; any other damage is a problem of the survey.
+    Raises StoreError only where no zarr group stands at `path`; any other damage is a problem of the summary.
     """
     require_folder(path, f"make one with 'manicm-ms collect ENV --out {path}'")
     if not (path / ".zattrs").is_file() and looks_like_dp3(path):
@@ -266,4 +266,4 @@ def survey(path: Path) -> Survey:
         )
     if not (path / ".zgroup").is_file() and not (path / "meta").is_dir():
         raise StoreError(f"{path} is not a store of demonstrations, a zarr group of format 2: name another folder")
-    return _Surveyor(path).run()
+    return _Summarizer(path).run()

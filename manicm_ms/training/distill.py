@@ -8,18 +8,20 @@ from rich.console import Console
 
 from manicm_ms.errors import CheckpointError, ConfigError, SpecMismatchError
 from manicm_ms.machine.devices import torch_threads
+from manicm_ms.policies.action_policy import ActionPolicy
 from manicm_ms.policies.checkpoint import load_checkpoint, read_manifest
-from manicm_ms.policies.diffusion import DiffusionPolicy
-from manicm_ms.policies.manicm import ManiCM
+from manicm_ms.policies.heads.diffusion import DiffusionHead
+from manicm_ms.policies.methods import student_of
 from manicm_ms.progress import working
 from manicm_ms.seeds import require_seed
 from manicm_ms.spec import EnvSpec, require_compatible
 from manicm_ms.training.demonstrations import Data, read_demos
-from manicm_ms.training.features import encode_windows
+from manicm_ms.training.features import encode_dataset
 from manicm_ms.training.loop import Batches
 from manicm_ms.training.objectives import DISTILLATIONS, PolicyObjective
 from manicm_ms.training.presets import StudentPreset
 from manicm_ms.training.session import Session
+from manicm_ms.training.settings import preset_identity
 
 
 def distill(
@@ -39,7 +41,7 @@ def distill(
 ) -> Path:
     """Distil a teacher and write the student's checkpoint; the same call goes on after a kill.
 
-    The student starts from the teacher's averaged weights and keeps its encoder and normaliser.
+    The student starts from the teacher's averaged weights and keeps its encoder and normalizer.
 
     Args:
         teacher: checkpoint folder of a diffusion policy.
@@ -70,7 +72,7 @@ def distill(
     require_compatible(demos.spec, policy.spec, f"the data {demos.provenance['path']}", f"the teacher {teacher}")
     if not allow_other_task:
         _require_same_task(demos.spec, demos.provenance["path"], policy.spec, teacher)
-    student = ManiCM.from_teacher(policy, nfe=preset.nfe, num_solver_steps=_solver_steps(policy, preset.skip))
+    student = student_of(policy, nfe=preset.nfe, num_solver_steps=_solver_steps(policy, preset.solver_stride))
     manifest = read_manifest(teacher)
     session = Session.start(
         "student", out, preset, device=device, precision=precision or preset.precision, seed=seed,
@@ -79,21 +81,21 @@ def distill(
     session.show_remarks(demos)
 
     def build() -> tuple[PolicyObjective, Batches]:
-        network = policy.network.to(session.fabric.device)
+        policy.to(session.fabric.device)
         seen = session.console if session.fabric.is_global_zero else None
         with torch_threads(preset.threads), working(seen, "encode the demonstrations"):
-            features = encode_windows(network, demos.windows.to(session.fabric.device), preset.draws, seed)
-        return objective_type(policy, student, preset.mu), features
+            features = encode_dataset(policy, demos.dataset.to(session.fabric.device), preset.draws, seed)
+        return objective_type(policy, student, preset.ema_decay), features
 
     weights = manifest["files"]["model.safetensors"]["sha256"]
-    inputs = {"teacher": weights, "data": demos.provenance["sha256"]}
+    inputs = {"teacher": weights, "data": demos.provenance["sha256"], "preset": preset_identity(preset)}
     made_from = {"path": str(teacher), "sha256": weights, "provenance": manifest["provenance"]}
     return session.complete(inputs, {"data": demos.provenance, "teacher": made_from}, build, snapshots)
 
 
-def _load_teacher(folder: Path) -> DiffusionPolicy:
+def _load_teacher(folder: Path) -> ActionPolicy:
     policy = load_checkpoint(folder)
-    if not isinstance(policy, DiffusionPolicy):
+    if not isinstance(policy.head, DiffusionHead):
         raise CheckpointError(f"{folder} holds a {policy.name}, which cannot be distilled: give a diffusion teacher")
     return policy
 
@@ -107,9 +109,9 @@ def _require_same_task(demonstrated: EnvSpec, data: str, learnt: EnvSpec, teache
         )
 
 
-def _solver_steps(teacher: DiffusionPolicy, skip: int) -> int:
-    """Return the grid points of a solver that spans `skip` of the teacher's timesteps at a time."""
-    timesteps = teacher.diffusion.num_train_timesteps
-    if timesteps % skip:
-        raise ConfigError(f"skip={skip} must divide the teacher's {timesteps} timesteps: try 10")
-    return timesteps // skip
+def _solver_steps(teacher: ActionPolicy, stride: int) -> int:
+    """Return the grid points of a solver that spans `stride` of the teacher's timesteps at a time."""
+    timesteps = teacher.head.config.num_train_timesteps
+    if timesteps % stride:
+        raise ConfigError(f"solver_stride={stride} must divide the teacher's {timesteps} timesteps: try 10")
+    return timesteps // stride

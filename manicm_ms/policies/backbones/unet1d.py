@@ -4,12 +4,16 @@ from __future__ import annotations
 
 import itertools
 import math
-from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import ClassVar
 
 import torch
 from torch import Tensor, nn
 
-from manicm_ms.errors import ConfigError
+from manicm_ms.errors import ConfigError, require_at_least
+from manicm_ms.policies.backbones.backbone import BACKBONES, Backbone
+from manicm_ms.policies.encoders.encoder import Features, FeatureShape
+from manicm_ms.spec import ChunkSpec
 
 
 class SinusoidalEmbedding(nn.Module):
@@ -92,7 +96,40 @@ class FiLMStack(nn.ModuleList):
         return x
 
 
-class UNet1D(nn.Module):
+@dataclass(frozen=True)
+class UNet1DConfig:
+    """Shape of the U-Net; the defaults are DP3's.
+
+    Attributes:
+        down_dims: channels of each stage.
+        resnets_per_stage: residual blocks of each stage; 2 in DP3, 1 in Simple DP3.
+        mid_blocks: residual blocks between the way down and the way up; 2 in DP3, 1 in Simple DP3.
+        kernel_size: taps of the convolutions, odd.
+        n_groups: of the group normalisations; divides every width.
+        step_embed_dim: of each time's embedding, even.
+    """
+
+    down_dims: tuple[int, ...] = (512, 1024, 2048)
+    resnets_per_stage: int = 2
+    mid_blocks: int = 2
+    kernel_size: int = 5
+    n_groups: int = 8
+    step_embed_dim: int = 128
+
+    def __post_init__(self) -> None:
+        if self.kernel_size % 2 == 0:
+            raise ConfigError(f"kernel_size must be odd, got {self.kernel_size}")
+        if self.step_embed_dim % 2 or self.step_embed_dim < 4:
+            raise ConfigError(f"step_embed_dim must be even and at least 4, got {self.step_embed_dim}")
+        if min(len(self.down_dims), self.resnets_per_stage, self.mid_blocks) < 1:
+            raise ConfigError("down_dims needs a stage, and resnets_per_stage and mid_blocks must be at least 1")
+        require_at_least(1, n_groups=self.n_groups, kernel_size=self.kernel_size, down_dims=min(self.down_dims))
+        if bad := [width for width in self.down_dims if width % self.n_groups]:
+            raise ConfigError(f"n_groups={self.n_groups} must divide every width of down_dims, not so for {bad}")
+
+
+@BACKBONES.register("unet1d")
+class UNet1D(Backbone):
     """Predicts the clean action chunk (or its noise) from a noisy one.
 
     Each stage but the last halves the time axis, and the way up doubles it again; skip connections join
@@ -103,58 +140,45 @@ class UNet1D(nn.Module):
         middle                              c -> c, 1
         up      2b -> a, 2 -> 4   <-   2c -> b, 1 -> 2        then a -> Da, 4
 
+    The condition of its blocks is the features' vector beside the sum of the embedded times.
+
     Args:
+        config: shape.
+        chunk: To, Tp, Ta; Tp must be a multiple of 2 for each stage but the first.
         action_dim: Da.
-        cond_dim: of the observation's features.
-        down_dims: width of each stage.
-        kernel_size: taps of the convolutions, odd.
-        n_groups: of the group normalisations.
-        step_embed_dim: of the diffusion time's embedding.
-        resnets_per_stage: residual blocks of each stage; 2 in DP3, 1 in Simple DP3.
-        mid_blocks: residual blocks between the way down and the way up; 2 in DP3, 1 in Simple DP3.
+        features: sizes of the observation's features.
+        times: number of times that condition it.
     """
 
+    Config = UNet1DConfig
+    sizes: ClassVar = {"quick": {"down_dims": (64, 128, 256)}, "smoke": {"down_dims": (32, 64)}}
+
     def __init__(
-        self,
-        action_dim: int,
-        cond_dim: int,
-        down_dims: Sequence[int] = (512, 1024, 2048),
-        kernel_size: int = 5,
-        n_groups: int = 8,
-        step_embed_dim: int = 128,
-        resnets_per_stage: int = 2,
-        mid_blocks: int = 2,
+        self, config: UNet1DConfig, chunk: ChunkSpec, action_dim: int, features: FeatureShape, times: int = 1
     ) -> None:
-        super().__init__()
-        self.down_dims = tuple(down_dims)
-        self.time_embedding = nn.Sequential(
-            SinusoidalEmbedding(step_embed_dim),
-            nn.Linear(step_embed_dim, 4 * step_embed_dim),
-            nn.Mish(),
-            nn.Linear(4 * step_embed_dim, step_embed_dim),
-        )
-        shape = (step_embed_dim + cond_dim, kernel_size, n_groups)
+        super().__init__(config, chunk, action_dim, features, times)
+        down_dims, embedded = config.down_dims, config.step_embed_dim
+        _check_horizon(chunk.horizon, len(down_dims))
+        self.time_embeddings = nn.ModuleList([_time_embedding(embedded) for _ in range(times)])
+        shape = ((embedded if times else 0) + features.cond, config.kernel_size, config.n_groups)
         pairs = list(itertools.pairwise((action_dim, *down_dims)))
-        self.down = nn.ModuleList([FiLMStack(resnets_per_stage, i, o, *shape) for i, o in pairs])
+        each = config.resnets_per_stage
+        self.down = nn.ModuleList([FiLMStack(each, i, o, *shape) for i, o in pairs])
         self.downsample = nn.ModuleList([nn.Conv1d(o, o, 3, stride=2, padding=1) for _, o in pairs[:-1]])
-        self.middle = FiLMStack(mid_blocks, down_dims[-1], down_dims[-1], *shape)
+        self.middle = FiLMStack(config.mid_blocks, down_dims[-1], down_dims[-1], *shape)
         upward = pairs[:0:-1]  # from the last stage to the second
-        self.up = nn.ModuleList([FiLMStack(resnets_per_stage, 2 * o, i, *shape) for i, o in upward])
+        self.up = nn.ModuleList([FiLMStack(each, 2 * o, i, *shape) for i, o in upward])
         self.upsample = nn.ModuleList([nn.ConvTranspose1d(i, i, 4, stride=2, padding=1) for i, _ in upward])
         self.head = nn.Sequential(
-            ConvBlock(down_dims[0], down_dims[0], kernel_size, n_groups), nn.Conv1d(down_dims[0], action_dim, 1)
+            ConvBlock(down_dims[0], down_dims[0], config.kernel_size, config.n_groups),
+            nn.Conv1d(down_dims[0], action_dim, 1),
         )
 
-    def check_horizon(self, horizon: int) -> None:
-        """Raise ConfigError where a chunk of `horizon` actions cannot be halved at every stage."""
-        unit = 2 ** (len(self.down_dims) - 1)
-        if horizon % unit:
-            raise ConfigError(f"horizon {horizon} is no multiple of {unit}, which {len(self.down_dims)} stages need")
-
-    def forward(self, x_t: Tensor, t: Tensor, cond: Tensor) -> Tensor:
-        """Return the prediction (B, Tp, Da) for noisy actions x_t (B, Tp, Da), times t (B,) and cond (B, cond_dim)."""
-        cond = torch.cat([self.time_embedding(t), cond], dim=-1)
-        x = x_t.transpose(1, 2)  # (B, Da, Tp)
+    def forward(self, x: Tensor, times: tuple[Tensor, ...], features: Features) -> Tensor:
+        """Return the prediction (B, Tp, Da) for noisy actions x (B, Tp, Da), times, each (B,), and features."""
+        embedded = [embed(t) for embed, t in zip(self.time_embeddings, times, strict=True)]
+        cond = torch.cat([sum(embedded[1:], embedded[0]), features.cond], dim=-1) if embedded else features.cond
+        x = x.transpose(1, 2)  # (B, Da, Tp)
         skips = []
         for index, stage in enumerate(self.down):
             x = stage(x, cond)
@@ -165,3 +189,19 @@ class UNet1D(nn.Module):
         for stage, upsample in zip(self.up, self.upsample, strict=True):
             x = upsample(stage(torch.cat([x, skips.pop()], dim=1), cond))
         return self.head(x).transpose(1, 2)
+
+
+def _time_embedding(dim: int) -> nn.Sequential:
+    return nn.Sequential(
+        SinusoidalEmbedding(dim),
+        nn.Linear(dim, 4 * dim),
+        nn.Mish(),
+        nn.Linear(4 * dim, dim),
+    )
+
+
+def _check_horizon(horizon: int, stages: int) -> None:
+    """Raise ConfigError where a chunk of `horizon` actions cannot be halved at every stage but the last."""
+    unit = 2 ** (stages - 1)
+    if horizon % unit:
+        raise ConfigError(f"horizon {horizon} is no multiple of {unit}, which {stages} stages need")

@@ -4,7 +4,8 @@ from policy_specs import CHUNK, TINY, make_obs, make_spec
 
 from manicm_ms.demos.stats import FieldStats
 from manicm_ms.errors import ConfigError
-from manicm_ms.policies.base import make_policy
+from manicm_ms.policies.configuration import merged
+from manicm_ms.policies.methods import make_policy
 
 
 def stats(spec, seed=0):
@@ -19,9 +20,10 @@ def stats(spec, seed=0):
     return {name: of(channels) for name, channels in sizes.items()}
 
 
-def network(spec, **changes):
-    config = {"network": TINY["network"] | changes}
-    return make_policy("simple_dp3", spec, CHUNK, config, stats=stats(spec), seed=0).network
+def made(spec, points=None, cloud_frame=None, **sections):
+    inputs = {"points": points or {}, "cloud_frame": cloud_frame or {}}
+    config = merged(TINY, {"inputs": inputs, **sections})
+    return make_policy("simple_dp3", spec, CHUNK, config, stats=stats(spec), seed=0)
 
 
 def moved(obs, spec, by):
@@ -32,14 +34,20 @@ def moved(obs, spec, by):
     return obs
 
 
-def cloud_features(net, obs):
-    return net.encoder.points(net.cloud_frame(obs["point_cloud"], obs["agent_pos"], net.normalizer).flatten(0, 1))
+def seen_cloud(policy, obs):
+    """Return the cloud (B, To, P, C) as the encoder gets it."""
+    normalized = {key: policy.normalizer.normalize(key, obs[key]) for key in policy.keys}
+    return policy.transforms["cloud_frame"].normalized(normalized, obs)["point_cloud"]
+
+
+def cloud_features(policy, obs):
+    return policy.encoder.points(seen_cloud(policy, obs).flatten(0, 1))
 
 
 def test_tcp_frame_subtracts_the_hand_of_the_same_frame_and_scales():
     spec = make_spec()
-    obs, net = make_obs(spec, 2), network(spec, cloud_frame="tcp", cloud_scale=0.15)
-    seen = net.cloud_frame(obs["point_cloud"], obs["agent_pos"], net.normalizer)
+    obs = make_obs(spec, 2)
+    seen = seen_cloud(made(spec, cloud_frame={"frame": "tcp", "scale": 0.15}), obs)
     for b in range(2):
         for t in range(2):
             tcp = obs["agent_pos"][b, t][[2, 0, 1]]  # where make_spec puts x, y, z
@@ -51,50 +59,57 @@ def test_moving_hand_and_cloud_together_is_invisible_in_the_tcp_frame_only(chann
     spec = make_spec(point_channels=channels)
     obs, by = make_obs(spec, 2), torch.tensor([0.3, -0.2, 0.1])
     for frame, same in (("tcp", True), ("base", False)):
-        net = network(spec, cloud_frame=frame)
-        a, b = cloud_features(net, obs), cloud_features(net, moved(obs, spec, by))
+        policy = made(spec, cloud_frame={"frame": frame})
+        a, b = cloud_features(policy, obs), cloud_features(policy, moved(obs, spec, by))
         assert torch.allclose(a, b, atol=1e-4) is same
 
 
 def test_colours_are_normalised_in_the_tcp_frame():
     spec = make_spec(point_channels=6)
-    obs, net = make_obs(spec, 2), network(spec, cloud_frame="tcp")
-    seen = net.cloud_frame(obs["point_cloud"], obs["agent_pos"], net.normalizer)
-    torch.testing.assert_close(seen[..., 3:], net.normalizer.normalize("point_cloud", obs["point_cloud"])[..., 3:])
+    obs, policy = make_obs(spec, 2), made(spec, cloud_frame={"frame": "tcp"})
+    expected = policy.normalizer.normalize("point_cloud", obs["point_cloud"])[..., 3:]
+    torch.testing.assert_close(seen_cloud(policy, obs)[..., 3:], expected)
 
 
 def test_tcp_frame_without_a_known_tcp_is_refused_with_the_remedy():
     with pytest.raises(ConfigError, match="use cloud_frame 'base'"):
-        network(make_spec(tcp=False), cloud_frame="tcp")
+        made(make_spec(tcp=False), cloud_frame={"frame": "tcp"})
+
+
+def test_auto_is_the_tools_frame_where_there_is_one_and_the_policy_says_which():
+    for tcp, frame in ((True, "tcp"), (False, "base")):
+        policy = made(make_spec(tcp=tcp), cloud_frame={"frame": "auto"})
+        assert policy.transforms["cloud_frame"].config.frame == frame
+        assert policy.config_dict()["inputs"]["cloud_frame"]["frame"] == frame
 
 
 def test_only_the_first_points_are_read_where_max_points_says_so():
     spec = make_spec(points=32)
-    obs, net = make_obs(spec, 2), network(spec, max_points=8)
+    obs, policy = make_obs(spec, 2), made(spec, points={"max_points": 8})
     prefix = {**obs, "point_cloud": obs["point_cloud"][:, :, :8]}
-    torch.testing.assert_close(net.encode(obs), net.encode(prefix), rtol=0, atol=0)
-    assert not torch.allclose(net.encode(obs), network(spec).encode(obs))
+    torch.testing.assert_close(policy.encode(obs), policy.encode(prefix), rtol=0, atol=0)
+    assert not torch.allclose(policy.encode(obs).cond, made(spec).encode(obs).cond)
 
 
 def test_both_frames_of_the_history_and_both_inputs_matter():
     spec = make_spec()
-    obs, net = make_obs(spec, 2), network(spec)
-    base = net.encode(obs)
-    assert base.shape == (2, net.cond_dim)
+    obs, policy = make_obs(spec, 2), made(spec)
+    base = policy.encode(obs).cond
+    assert base.shape == (2, policy.encoder.shape.cond)
     for key in ("point_cloud", "agent_pos"):
         for frame in range(2):
             other = {k: v.clone() for k, v in obs.items()}
             other[key][:, frame] += 0.5
-            assert (net.encode(other) - base).abs().amax(1).min() > 1e-3
+            assert (policy.encode(other).cond - base).abs().amax(1).min() > 1e-3
 
 
 def test_least_range_holds_for_the_state_and_never_for_actions():
     spec, least = make_spec(), 4.0  # every range of `stats` lies between 0.5 and 1.5
-    plain, held = network(spec), network(spec, min_state_range=least)
+    plain, held = made(spec), made(spec, normalizer={"min_state_range": least})
     for field in ("point_cloud", "agent_pos", "action"):
         low, high = (torch.as_tensor(getattr(stats(spec)[field], name)) for name in ("min", "max"))
         share = (high - low) / least if field == "agent_pos" else torch.ones_like(low)
         torch.testing.assert_close(held.normalizer.normalize(field, high), share)
         torch.testing.assert_close(plain.normalizer.normalize(field, high), torch.ones_like(high))
     with pytest.raises(ConfigError, match="min_state_range"):
-        network(spec, min_state_range=-1.0)
+        made(spec, normalizer={"min_state_range": -1.0})

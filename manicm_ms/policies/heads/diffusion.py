@@ -1,23 +1,22 @@
-"""The diffusion teacher: clean action and noise as separate quantities, DDIM sampling, the one-step control."""
+"""The diffusion head: clean action and noise as separate quantities, DDIM sampling, the one-step control."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from dataclasses import asdict, dataclass
-from typing import Any, ClassVar, NamedTuple, Protocol
+from dataclasses import dataclass, replace
+from typing import Any, ClassVar, NamedTuple, Protocol, TypeVar
 
 import torch
 from diffusers.schedulers.scheduling_ddim import DDIMScheduler
 from diffusers.schedulers.scheduling_ddpm import DDPMScheduler
 from torch import Tensor
+from torch.nn.functional import mse_loss
 
 from manicm_ms.errors import ConfigError
-from manicm_ms.policies.base import ChannelStats, Policy, check_obs, starting_noise
-from manicm_ms.policies.denoiser import ConditionedDenoiser
-from manicm_ms.policies.finite import finite_obs, require_finite_actions
-from manicm_ms.policies.normalizer import Normalizer
+from manicm_ms.policies.backbones.backbone import Backbone
+from manicm_ms.policies.encoders.encoder import Features, FeatureShape
+from manicm_ms.policies.heads.head import HEADS, State, TrainableHead
 from manicm_ms.registry import Registry
-from manicm_ms.spec import ACTION, ChunkSpec, EnvSpec
+from manicm_ms.spec import ChunkSpec
 
 
 def epsilon_from_x0(x_t: Tensor, x0: Tensor, alpha_bar: Tensor) -> Tensor:
@@ -75,6 +74,9 @@ class Prediction(Protocol):
 
     def student_x0(self, x0: Tensor, limit: float) -> Tensor:
         """Return the clean action as a student's loss sees it; in sampling it is clipped to [-limit, limit]."""
+
+
+Head = TypeVar("Head", bound="DiffusionHead")
 
 
 PREDICTIONS: Registry[type[Prediction]] = Registry("prediction_type")
@@ -159,11 +161,19 @@ class DiffusionConfig:
 
     def __post_init__(self) -> None:
         PREDICTIONS.get(self.prediction_type)
+        if not self.clip_range > 0:
+            raise ConfigError(f"clip_range must be above 0, got {self.clip_range}")
         if not 1 <= self.num_inference_steps <= self.num_train_timesteps:
             raise ConfigError(
                 f"num_inference_steps={self.num_inference_steps} must lie between 1 and "
                 f"num_train_timesteps={self.num_train_timesteps}"
             )
+        try:
+            self.ddpm()
+        except NotImplementedError as error:
+            raise ConfigError(
+                f"diffusers has no beta_schedule {self.beta_schedule!r}: try squaredcos_cap_v2"
+            ) from error
 
     def ddpm(self) -> DDPMScheduler:
         """Return the noising process for training."""
@@ -186,173 +196,137 @@ class DiffusionConfig:
         }
 
 
-class DiffusionPolicy(Policy):
-    """Samples an action chunk by DDIM from a network conditioned on the observation (DP3, Ze et al. 2024).
+@HEADS.register("diffusion")
+class DiffusionHead(TrainableHead):
+    """Samples a chunk by DDIM from a network conditioned on the observation (DP3, Ze et al. 2024).
 
     Args:
-        name: in `POLICIES`.
-        network: encoder, U-Net and normaliser.
-        spec: the environment that it is made for.
+        config: noising process and sampler.
+        backbone: predicts the clean chunk, or its noise, from a noisy one and its time.
         chunk: To, Tp, Ta.
-        diffusion: noising process and sampler.
+        action_dim: Da.
+        features: sizes of the observation's features.
 
     Attributes:
         alphas_cumprod: (T,) alpha_bar at each time.
     """
 
+    Config = DiffusionConfig
+    needs_backbone = True
+    role: ClassVar[str | None] = "teacher"
     alphas_cumprod: Tensor
+    config: DiffusionConfig
+    backbone: Backbone
 
     def __init__(
-        self, name: str, network: ConditionedDenoiser, spec: EnvSpec, chunk: ChunkSpec, diffusion: DiffusionConfig
+        self, config: DiffusionConfig, backbone: Backbone, chunk: ChunkSpec, action_dim: int, features: FeatureShape
     ) -> None:
-        super().__init__()
-        self.name, self.spec, self.chunk, self.diffusion = name, spec, chunk, diffusion
-        self.network = network
-        self.prediction: Prediction = PREDICTIONS.get(diffusion.prediction_type)()
-        self.register_buffer("alphas_cumprod", diffusion.ddpm().alphas_cumprod.clone(), persistent=False)
+        super().__init__(config, backbone, chunk, action_dim, features)
+        self.prediction: Prediction = PREDICTIONS.get(config.prediction_type)()
+        self.register_buffer("alphas_cumprod", config.ddpm().alphas_cumprod.clone(), persistent=False)
         self._samplers: dict[int, DDIMScheduler] = {}
 
     @property
     def nfe(self) -> int:
         """Number of DDIM steps."""
-        return self.diffusion.num_inference_steps
-
-    @property
-    def normalizer(self) -> Normalizer:
-        """The network's normaliser."""
-        return self.network.normalizer
-
-    def config_dict(self) -> dict[str, Any]:
-        """Return the sections `network` and `diffusion`."""
-        return {"network": asdict(self.network.config), "diffusion": asdict(self.diffusion)}
-
-    def fit_normalizer(self, stats: Mapping[str, ChannelStats]) -> None:
-        """Set the normaliser from the ranges of `point_cloud`, `agent_pos` and `action`."""
-        self.network.fit_normalizer(stats)
+        return self.config.num_inference_steps
 
     def add_noise(self, x0: Tensor, epsilon: Tensor, t: Tensor) -> Tensor:
         """Return x_t = sqrt(abar_t) x0 + sqrt(1 - abar_t) epsilon, all (B, Tp, Da), for integer times t (B,)."""
         alpha_bar = self.alphas_cumprod[t][:, None, None]
         return alpha_bar.sqrt() * x0 + (1 - alpha_bar).sqrt() * epsilon
 
-    def predict_x0(self, x_t: Tensor, t: Tensor, cond: Tensor) -> Tensor:
+    def loss(self, features: Features, action: Tensor, generator: torch.Generator) -> Tensor:
+        """Return E |output(x_t, t, obs) - target|^2 over t, noise and rows (Ho et al. 2020, equation 14).
+
+        The target is x0 or epsilon, as `prediction_type` has it. Arguments as for `TrainableHead.loss`.
+        """
+        epsilon = torch.randn(action.shape, generator=generator, device=action.device)
+        last = self.config.num_train_timesteps
+        t = torch.randint(last, (len(action),), generator=generator, device=action.device)
+        output = self.denoise(self.add_noise(action, epsilon, t), t, features)
+        return mse_loss(output, self.prediction.target(action, epsilon))
+
+    def denoise(self, x_t: Tensor, t: Tensor, features: Features) -> Tensor:
+        """Return the network's output (B, Tp, Da), float32, for x_t (B, Tp, Da) normalised and times t (B,)."""
+        return self.backbone(x_t, (t,), features).float()
+
+    def predict_x0(self, x_t: Tensor, t: Tensor, features: Features) -> Tensor:
         """Return the clean chunk that the network sees in a noisy one, clipped as in sampling.
 
         Args:
             x_t: (B, Tp, Da) normalised noisy actions.
             t: (B,) int64 times.
-            cond: (B, cond_dim) features from `network.encode`.
+            features: of the observations.
 
         Returns:
             (B, Tp, Da) normalised, within the clipping range.
         """
-        return self.guess(x_t, t, cond).x0
+        return self.guess(x_t, t, features).x0
 
-    def guess(self, x_t: Tensor, t: Tensor, cond: Tensor) -> Guess:
+    def guess(self, x_t: Tensor, t: Tensor, features: Features) -> Guess:
         """Return the clean chunk and the noise with which `sample` takes its step; arguments as for `predict_x0`."""
-        output, limit = self.network.denoise(x_t, t, cond).float(), self.diffusion.clip_range
+        x0, epsilon = self.raw_guess(x_t, t, features)
+        return Guess(x0.clamp(-self.config.clip_range, self.config.clip_range), epsilon)
+
+    def raw_guess(self, x_t: Tensor, t: Tensor, features: Features) -> Guess:
+        """Return what the output implies before clipping; arguments as for `predict_x0`."""
+        output = self.denoise(x_t, t, features)
         alpha_bar = self.alphas_cumprod[t][:, None, None]
-        x0 = self.prediction.x0(output, x_t, alpha_bar)
-        return Guess(x0.clamp(-limit, limit), self.prediction.epsilon(output, x_t, alpha_bar))
+        return Guess(self.prediction.x0(output, x_t, alpha_bar), self.prediction.epsilon(output, x_t, alpha_bar))
 
     @property
     def first_time(self) -> int:
         """Time at which a single evaluation reads pure noise; see `Prediction.timestep_spacing`."""
         if self.prediction.timestep_spacing == "trailing":
-            return self.diffusion.num_train_timesteps - 1
-        return int(self._sampler(self.diffusion.num_inference_steps).timesteps[0])
+            return self.config.num_train_timesteps - 1
+        return int(self._sampler(self.config.num_inference_steps).timesteps[0])
 
-    def sample(self, cond: Tensor, noise: Tensor, num_inference_steps: int | None = None) -> Tensor:
+    def sample(self, features: Features, noise: Tensor) -> Tensor:
         """Return a normalised chunk (B, Tp, Da) denoised from `noise` (B, Tp, Da) by DDIM without added noise."""
-        sampler = self._sampler(num_inference_steps or self.diffusion.num_inference_steps)
+        sampler = self._sampler(self.config.num_inference_steps)
         x_t = noise
         for t in sampler.timesteps.tolist():
-            output = self.network.denoise(x_t, torch.full((len(x_t),), t, device=x_t.device), cond).float()
+            output = self.denoise(x_t, torch.full((len(x_t),), t, device=x_t.device), features)
             x_t = sampler.step(output, t, x_t, return_dict=False)[0]
         return x_t
 
-    @torch.inference_mode()
-    def act(
-        self,
-        obs: Mapping[str, Tensor],
-        *,
-        generator: torch.Generator | None = None,
-        noise: Tensor | None = None,
-        num_inference_steps: int | None = None,
-    ) -> Tensor:
-        """Choose the next actions; see `Policy.act`. `num_inference_steps` overrides the configured number."""
-        batch, obs = check_obs(obs, self.spec, self.chunk), finite_obs(obs, self.spec)
-        (start,) = starting_noise(self, batch, generator, noise)
-        chunk = self.sample(self.network.encode_acting(obs, start), start, num_inference_steps)
-        return executed_actions(self, chunk)
+    def act(self, features: Features, noise: tuple[Tensor, ...], state: State | None) -> tuple[Tensor, State | None]:
+        """Choose chunks by `sample`; see `ActionHead.act`."""
+        del state
+        return self.sample(features, noise[0]), None
+
+    def with_steps(self, num_inference_steps: int) -> DiffusionHead:
+        """Return a head of the same weights that samples in another number of steps."""
+        return self._of_same_weights(DiffusionHead, replace(self.config, num_inference_steps=num_inference_steps))
+
+    def one_step(self) -> OneStepHead:
+        """Return the control of a distillation; see `OneStepHead`."""
+        return self._of_same_weights(OneStepHead, self.config)
+
+    def _of_same_weights(self, kind: type[Head], config: DiffusionConfig) -> Head:
+        """Return a head of a kind that is made as this one, on the same device, with the same backbone."""
+        return kind(config, self.backbone, *self.shape).to(self.alphas_cumprod.device)
 
     def _sampler(self, steps: int) -> DDIMScheduler:
         if steps not in self._samplers:
-            self._samplers[steps] = self.diffusion.ddim(steps)
+            self._samplers[steps] = self.config.ddim(steps)
         return self._samplers[steps]
 
 
-class OneStepTeacher(Policy):
+class OneStepHead(DiffusionHead):
     """The control for distillation: the undistilled teacher's own guess at x0 from pure noise, in one evaluation.
 
-    Args:
-        teacher: the policy that is run at its `first_time` only; its weights are shared.
+    It is run at `first_time` only, and is not saved: its weights are the teacher's.
     """
 
-    registered = False
-
-    def __init__(self, teacher: DiffusionPolicy) -> None:
-        super().__init__()
-        self.teacher = teacher
-        self.name, self.spec, self.chunk = f"{teacher.name}_one_step", teacher.spec, teacher.chunk
+    role = None
 
     @property
     def nfe(self) -> int:
         """One."""
         return 1
 
-    @property
-    def network(self) -> ConditionedDenoiser:
-        """The teacher's network."""
-        return self.teacher.network
-
-    @property
-    def normalizer(self) -> Normalizer:
-        """The teacher's normaliser."""
-        return self.teacher.normalizer
-
-    def config_dict(self) -> dict[str, Any]:
-        """Return the teacher's configuration."""
-        return self.teacher.config_dict()
-
-    def fit_normalizer(self, stats: Mapping[str, ChannelStats]) -> None:
-        """Set the teacher's normaliser."""
-        self.teacher.fit_normalizer(stats)
-
-    @torch.inference_mode()
-    def act(
-        self, obs: Mapping[str, Tensor], *, generator: torch.Generator | None = None, noise: Tensor | None = None
-    ) -> Tensor:
-        """Choose the next actions; see `Policy.act`."""
-        batch, obs = check_obs(obs, self.spec, self.chunk), finite_obs(obs, self.spec)
-        (start,) = starting_noise(self, batch, generator, noise)
-        last = torch.full((batch,), self.teacher.first_time, device=start.device)
-        return executed_actions(self, self.teacher.predict_x0(start, last, self.network.encode_acting(obs, start)))
-
-
-class _HasNormalizer(Protocol):
-    name: str
-    chunk: ChunkSpec
-
-    @property
-    def normalizer(self) -> Normalizer: ...
-
-
-def executed_actions(policy: _HasNormalizer, chunk: Tensor) -> Tensor:
-    """Return the executed part (B, Ta, Da) of a normalised chunk (B, Tp, Da), in env units clipped to [-1, 1].
-
-    Raises NotFiniteError where it holds NaN or infinity.
-    """
-    actions = policy.normalizer.unnormalize(ACTION, chunk[:, policy.chunk.executed])
-    require_finite_actions(actions, policy.name)
-    return actions.clamp(-1.0, 1.0)
+    def sample(self, features: Features, noise: Tensor) -> Tensor:
+        """Return the guess (B, Tp, Da) at the clean chunk."""
+        return self.predict_x0(noise, torch.full((len(noise),), self.first_time, device=noise.device), features)

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 import torch
 
-from manicm_ms.demos.windows import Windows, window_index
+from manicm_ms.demos.sequence_dataset import SequenceDataset, sequence_index
 from manicm_ms.errors import ConfigError
 from manicm_ms.spec import ChunkSpec
 
@@ -31,7 +31,7 @@ def dp3_sequences(episode_ends, horizon, pad_before, pad_after):
 @pytest.mark.parametrize("shape", [(2, 4, 3), (2, 4, 2), (1, 1, 1), (2, 16, 8), (3, 8, 6), (1, 5, 1)])
 def test_index_equals_dp3(ends, shape):
     chunk = ChunkSpec(*shape)
-    ours = window_index(np.array(ends), chunk)
+    ours = sequence_index(np.array(ends), chunk)
     theirs = dp3_sequences(ends, chunk.horizon, chunk.n_obs_steps - 1, chunk.n_action_steps - 1)
     assert ours.tolist() == theirs
 
@@ -45,7 +45,7 @@ def arrays():
 
 def test_batch_holds_the_frames_of_its_windows(arrays):
     chunk = ChunkSpec(2, 4, 3)
-    windows = Windows.from_arrays(*arrays, chunk)
+    windows = SequenceDataset.from_arrays(*arrays, chunk)
     assert len(windows) == 12
     picked = torch.tensor([0, 4, 5, 11])
     batch = windows.batch(picked)
@@ -62,16 +62,16 @@ def test_batch_holds_the_frames_of_its_windows(arrays):
 
 def test_windows_do_not_share_memory_with_the_arrays(arrays):
     cloud = arrays[0].astype(np.float32)
-    windows = Windows.from_arrays(cloud, *arrays[1:], ChunkSpec())
+    windows = SequenceDataset.from_arrays(cloud, *arrays[1:], ChunkSpec())
     cloud[:] = -1
     assert windows.point_cloud.min() == 0
 
 
 def test_no_window_is_refused(arrays):
     with pytest.raises(ConfigError, match="no window of horizon 40"):
-        Windows.from_arrays(*arrays, ChunkSpec(1, 40, 1))
+        SequenceDataset.from_arrays(*arrays, ChunkSpec(1, 40, 1))
 
 
 def test_arrays_of_different_length_are_refused(arrays):
     with pytest.raises(ConfigError, match="differ in length"):
-        Windows.from_arrays(arrays[0][:-1], *arrays[1:], ChunkSpec())
+        SequenceDataset.from_arrays(arrays[0][:-1], *arrays[1:], ChunkSpec())

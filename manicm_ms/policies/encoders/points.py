@@ -2,12 +2,17 @@
 
 from __future__ import annotations
 
-from typing import Protocol
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from typing import ClassVar, Protocol
 
 import torch
 from torch import Tensor
 
+from manicm_ms.errors import ConfigError
+from manicm_ms.policies.encoders.transform import TRANSFORMS, InputTransform, Obs
 from manicm_ms.registry import Registry
+from manicm_ms.spec import POINT_CLOUD, EnvSpec
 
 
 class PointChoice(Protocol):
@@ -72,6 +77,78 @@ class RandomPoints:
 
 POINT_CHOICES.add("prefix", Prefix())
 POINT_CHOICES.add("random", RandomPoints())
+
+
+@dataclass(frozen=True)
+class PointSubsetConfig:
+    """How many points of a cloud are read, and which.
+
+    Attributes:
+        max_points: so many points of a cloud are read, all where None.
+        acting: which ones when acting, a name in `POINT_CHOICES`: "prefix" (clouds are stored in farthest-point order,
+            so a prefix is a coarser cloud) or "random" (drawn anew for each decision, from its noise).
+        training: which ones in each step of training: "random" or "prefix".
+    """
+
+    max_points: int | None = None
+    acting: str = "prefix"
+    training: str = "random"
+
+    def __post_init__(self) -> None:
+        POINT_CHOICES.get(self.acting)
+        POINT_CHOICES.get(self.training)
+        if self.max_points is not None and self.max_points < 1:
+            raise ConfigError(f"max_points must be at least 1 or None, got {self.max_points}")
+
+
+@TRANSFORMS.register("points")
+class PointSubset(InputTransform):
+    """Reads fewer points than a cloud holds.
+
+    Args:
+        config: how many and which.
+        spec: the environment.
+    """
+
+    Config = PointSubsetConfig
+    sizes: ClassVar = {"quick": {"max_points": 128}, "smoke": {"max_points": 64}}
+    config: PointSubsetConfig
+
+    def __init__(self, config: PointSubsetConfig, spec: EnvSpec) -> None:
+        super().__init__(config, spec)
+
+    def read_acting(self, obs: Obs, noise: Tensor) -> Obs:
+        """See `InputTransform.read_acting`."""
+        return self._subset(obs, lambda cloud, n: POINT_CHOICES.get(self.config.acting).acting(cloud, n, noise))
+
+    def read_training(self, obs: Obs, generator: torch.Generator) -> Obs:
+        """See `InputTransform.read_training`."""
+        return self._subset(obs, lambda cloud, n: POINT_CHOICES.get(self.config.training).training(cloud, n, generator))
+
+    def varies(self, obs: Obs) -> bool:
+        """See `InputTransform.varies`."""
+        return self._count(obs) is not None and any(
+            POINT_CHOICES.get(choice).varies for choice in (self.config.acting, self.config.training)
+        )
+
+    @property
+    def acts_on_noise(self) -> bool:
+        """See `InputTransform.acts_on_noise`."""
+        return POINT_CHOICES.get(self.config.acting).varies
+
+    def act_on(self, choice: str) -> None:
+        """Read other points when acting from now on, by a name in `POINT_CHOICES`; a checkpoint saved later says so."""
+        self.config = replace(self.config, acting=choice)
+
+    def _count(self, obs: Obs) -> int | None:
+        """Return how many points are read of clouds that hold more, or None."""
+        count = self.config.max_points
+        return count if count is not None and count < obs[POINT_CLOUD].shape[2] else None
+
+    def _subset(self, obs: Obs, choose: Callable[[Tensor, int], Tensor]) -> Obs:
+        count = self._count(obs)
+        return obs if count is None else {**obs, POINT_CLOUD: choose(obs[POINT_CLOUD], count)}
+
 
 _WORD = 0xFFFFFFFF
 _STEP = 0x9E3779B9  # 2^32 / golden ratio: spreads consecutive counters over all words

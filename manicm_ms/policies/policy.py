@@ -3,22 +3,18 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Mapping
-from dataclasses import fields
-from typing import Any, ClassVar, Protocol, TypeVar
+from collections.abc import Mapping, Sequence
+from typing import Any, Protocol
 
 import torch
 from torch import Tensor, nn
 
 from manicm_ms.errors import ConfigError, SpecMismatchError
-from manicm_ms.registry import Registry
-from manicm_ms.spec import AGENT_POS, POINT_CLOUD, ChunkSpec, EnvSpec
-
-Config = TypeVar("Config")
+from manicm_ms.spec import AGENT_POS, ANY, POINT_CLOUD, ChunkSpec, EnvSpec
 
 
 class ChannelStats(Protocol):
-    """Range of a field: what a normaliser is fitted from (`manicm_ms.demos.stats.FieldStats` is one).
+    """Range of a field: what a normalizer is fitted from (`manicm_ms.demos.stats.FieldStats` is one).
 
     Attributes:
         min: (C,) smallest value of each channel, in the field's unit.
@@ -34,11 +30,23 @@ class ChannelStats(Protocol):
         """Return the largest value of each channel."""
 
 
+class Observer(Protocol):
+    """What reads observations: a policy of ours, or a user's own.
+
+    Attributes:
+        spec: the environment that it was made for.
+        chunk: To, Tp, Ta.
+    """
+
+    spec: EnvSpec
+    chunk: ChunkSpec
+
+
 class Policy(nn.Module, ABC):
     """Maps observations to actions.
 
     Attributes:
-        name: the policy's name in `POLICIES`.
+        name: of the method, as a rule one in `METHODS`.
         spec: the environment that it was made for.
         chunk: To, Tp, Ta.
     """
@@ -46,8 +54,8 @@ class Policy(nn.Module, ABC):
     name: str
     spec: EnvSpec
     chunk: ChunkSpec
-    registered: ClassVar[bool] = True
-    """Whether `POLICIES` can rebuild it from `config_dict`; False for wrappers that are not saved."""
+    keys: tuple[str, ...] = (POINT_CLOUD, AGENT_POS)
+    """Observations that it reads."""
 
     @property
     @abstractmethod
@@ -80,14 +88,6 @@ class Policy(nn.Module, ABC):
         return self.act(obs, noise=noise), state
 
     @abstractmethod
-    def config_dict(self) -> dict[str, Any]:
-        """Return plain JSON values from which `POLICIES.get(name)` rebuilds the untrained policy."""
-
-    @abstractmethod
-    def fit_normalizer(self, stats: Mapping[str, ChannelStats]) -> None:
-        """Set the normaliser from the ranges of `point_cloud`, `agent_pos` and `action`."""
-
-    @abstractmethod
     def act(
         self, obs: Mapping[str, Tensor], *, generator: torch.Generator | None = None, noise: Tensor | None = None
     ) -> Tensor:
@@ -116,82 +116,46 @@ class Policy(nn.Module, ABC):
         return next(self.parameters()).device
 
 
-POLICIES: Registry[Callable[[Mapping[str, Any], EnvSpec, ChunkSpec], Policy]] = Registry(
-    "policy", package="manicm_ms.policies"
-)
-"""name -> factory(config, spec, chunk); keys missing from `config` take the policy's published values."""
-
-
-def make_policy(
-    name: str,
-    spec: EnvSpec,
-    chunk: ChunkSpec,
-    config: Mapping[str, Any] | None = None,
-    *,
-    stats: Mapping[str, ChannelStats] | None = None,
-    seed: int | None = None,
-) -> Policy:
-    """Build an untrained policy.
+def check_obs(obs: Mapping[str, Tensor], spec: EnvSpec, chunk: ChunkSpec, keys: Sequence[str]) -> int:
+    """Return B, the number of rows in `obs`; raise SpecMismatchError where a shape is not the policy's.
 
     Args:
-        name: a name in `POLICIES`.
-        spec: the environment that it is made for.
+        obs: key -> (B, To, ...).
+        spec: says how a frame of each key looks.
         chunk: To, Tp, Ta.
-        config: departures from the published configuration, for example
-            `{"network": {"down_dims": (64, 128, 256), "cloud_frame": "tcp"}}`.
-        stats: ranges of the training data; without them the normaliser is the identity.
-        seed: of the initial weights; torch's default generator is left as it was. None draws from it.
-
-    Raises:
-        UnknownNameError: no policy has this name.
-        ConfigError: a field is unknown, out of range, or does not fit `spec` or `chunk`.
+        keys: what the policy reads.
     """
-    factory = POLICIES.get(name)
-    if seed is None:
-        policy = factory(config or {}, spec, chunk)
-    else:
-        with torch.random.fork_rng(devices=[]):
-            torch.manual_seed(seed)
-            policy = factory(config or {}, spec, chunk)
-    if stats is not None:
-        policy.fit_normalizer(stats)
-    return policy
-
-
-def updated_config(default: Config, changes: Mapping[str, Any], kind: str) -> Config:
-    """Return the frozen dataclass `default` with `changes`, which may come from JSON (lists become tuples).
-
-    Raises ConfigError for a key that is no field of it.
-    """
-    known = {f.name for f in fields(default)}  # type: ignore[arg-type]
-    if unknown := sorted(set(changes) - known):
-        raise ConfigError(f"{kind} has no field {', '.join(unknown)}: its fields are {', '.join(sorted(known))}")
-    values = {name: getattr(default, name) for name in known}
-    values.update({k: tuple(v) if isinstance(v, list) else v for k, v in changes.items()})
-    return type(default)(**values)
-
-
-def check_sections(config: Mapping[str, Any], sections: tuple[str, ...], kind: str) -> None:
-    """Raise ConfigError where `config` holds a key that is none of `sections`."""
-    if unknown := sorted(set(config) - set(sections)):
-        raise ConfigError(f"{kind} configuration has no section {', '.join(unknown)}: use {', '.join(sections)}")
-
-
-def check_obs(obs: Mapping[str, Tensor], spec: EnvSpec, chunk: ChunkSpec) -> int:
-    """Return B, the number of rows in `obs`; raise SpecMismatchError where a shape is not the policy's."""
-    for key, rank, tail in (
-        (POINT_CLOUD, 4, (spec.obs.point_channels,)),
-        (AGENT_POS, 3, (spec.obs.agent_pos_dim,)),
-    ):
+    rows = 0
+    for key in keys:
         if key not in obs:
             raise SpecMismatchError(f"the policy reads {key!r} and got only {sorted(obs)}: ask the environment for it")
-        shape = tuple(obs[key].shape)
-        if len(shape) != rank or shape[1] != chunk.n_obs_steps or shape[-1:] != tail:
-            want = f"(B, {chunk.n_obs_steps}, {'P, ' if rank == 4 else ''}{tail[0]})"
+        shape, frame = tuple(obs[key].shape), spec.observation(key).shape
+        fits = len(shape) == 2 + len(frame) and shape[1] == chunk.n_obs_steps
+        if not fits or any(n not in (m, ANY) for m, n in zip(shape[2:], frame, strict=True)):
+            axes = ", ".join(["B", str(chunk.n_obs_steps), *("P" if n == ANY else str(n) for n in frame)])
             raise SpecMismatchError(
-                f"{key} has shape {shape} and this policy reads {want}: make the environment with the policy's chunk"
+                f"{key} has shape {shape} and this policy reads ({axes}): make the environment with the policy's chunk"
             )
-    return obs[POINT_CLOUD].shape[0]
+        rows = shape[0]
+    return rows
+
+
+def example_observations(policy: Observer, batch: int = 1, seed: int = 0) -> dict[str, Tensor]:
+    """Return observations of the right shapes for any policy, on the CPU: each key that it reads as (B, To, ...).
+
+    Values are uniform in [0, 1): a decision takes the same operations whatever they are.
+
+    Args:
+        policy: ours, or a user's own with `spec` and `chunk`.
+        batch: B, rows.
+        seed: of the values.
+    """
+    generator = torch.Generator().manual_seed(seed)
+    found = {}
+    for key in getattr(policy, "keys", (POINT_CLOUD, AGENT_POS)):
+        shape = tuple(policy.spec.obs.num_points if n == ANY else n for n in policy.spec.observation(key).shape)
+        found[key] = torch.rand((batch, policy.chunk.n_obs_steps, *shape), generator=generator)
+    return found
 
 
 def starting_noise(

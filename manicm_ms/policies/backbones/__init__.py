@@ -1,0 +1,1 @@
+"""Networks over an action chunk; a file in here that registers one is found."""
