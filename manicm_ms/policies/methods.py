@@ -183,6 +183,21 @@ METHODS.add(
         optimizer={"betas": (0.9, 0.999), "weight_decay": 0.0},
     ),
 )
+METHODS.add(
+    "pocket_dp3",
+    Method(
+        sentence="Pocket DP3: DP3 with a mixer of 2.5 million weights for a U-Net, evaluated twice a decision.",
+        reference="arXiv:2601.22018, arXiv:2605.01581",
+        encoder="dp3",
+        backbone="mixer",
+        head={NAME: "diffusion", "num_inference_steps": 2},
+        objective="averaged",
+        nfe=2,
+        chunk=ChunkSpec(2, 4, 3),
+        size_chunks=_PAPER,
+        inputs=_CLOUD_INPUTS,
+    ),
+)
 
 
 def methods_of(role: str) -> tuple[str, ...]:
