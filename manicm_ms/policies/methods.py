@@ -198,6 +198,20 @@ METHODS.add(
         inputs=_CLOUD_INPUTS,
     ),
 )
+METHODS.add(
+    "bc_rnn_3d",
+    Method(
+        sentence="Behaviour cloning with an LSTM over the last 10 frames, one action a decision.",
+        reference="Mandlekar et al. 2021, robomimic, arXiv:2108.03298",
+        encoder="dp3",
+        head="rnn",
+        objective="plain",
+        nfe=1,
+        chunk=ChunkSpec(10, 10, 1),
+        inputs=_CLOUD_INPUTS,
+        optimizer={"betas": (0.9, 0.999), "weight_decay": 0.0},
+    ),
+)
 
 
 def methods_of(role: str) -> tuple[str, ...]:
