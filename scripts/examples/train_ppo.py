@@ -1,7 +1,7 @@
 """Trains PPO (Stable-Baselines3, extra `rl`) on a task's dense reward from privileged state, and draws its curve.
 
 python scripts/examples/train_ppo.py train --seed 0      # writes runs/ppo/0: settings, curve, weights
-python scripts/examples/train_ppo.py judge runs/ppo/0    # plays new seeds, beside random actions, idling and the expert
+python scripts/examples/train_ppo.py evaluate runs/ppo/0 # plays new seeds, beside random actions, idling and the expert
 python scripts/examples/train_ppo.py report runs/ppo/0   # a table, and docs/images/ppo_slide_block.png
 
 After every few updates the policy plays episodes of its own; curve and weights are written then, so that a stopped run
@@ -47,8 +47,10 @@ PICTURE = Path(__file__).resolve().parents[2] / "docs" / "images" / "ppo_slide_b
 SETTINGS, CURVE, WEIGHTS, SCORES = "settings.json", "curve.json", "policy.safetensors", "scores.json"
 REFERENCES = {"expert": "--", "random actions": ":", "idle": "-."}
 """Whom PPO is compared with, and the line that each is drawn with."""
-TRAINING_SEEDS = 1_000_000  # training of seed s plays episodes from (s + 1) times this; what is judged starts at 0
-FINAL_SEEDS = 10_000  # first seed of the episodes that judge the trained policy; those of the curve start at 0
+TRAINING_SEEDS = 1_000_000  # training of seed s plays episodes from (s + 1) times this; what is evaluated starts at 0
+FINAL_SEEDS = (
+    10_000  # first seed of the episodes on which the trained policy is evaluated; those of the curve start at 0
+)
 
 HELD = 4  # control steps that an action is held: five decisions a second explore further than twenty
 GAMMA = 0.9  # per decision: ten of them, two seconds; the dense reward leads the way
@@ -90,7 +92,7 @@ class Train:
 
 
 @dataclass(frozen=True)
-class Judge:
+class Evaluate:
     """Play fresh seeds with a trained policy, random actions, no actions and the expert.
 
     Attributes:
@@ -104,7 +106,7 @@ class Judge:
 
 @dataclass(frozen=True)
 class Report:
-    """Print a table of judged runs and draw their curves.
+    """Print a table of evaluated runs and draw their curves.
 
     Attributes:
         runs: their folders.
@@ -270,11 +272,11 @@ def play(env: VecEnv, player: Player, seeds: Sequence[int]) -> Score:
 
 
 class CurveCallback(BaseCallback):
-    """Judges the policy every `eval_every` control steps, keeps curve and weights, and stops when asked."""
+    """Evaluates the policy every `eval_every` control steps, keeps curve and weights, and stops when asked."""
 
-    def __init__(self, args: Train, out: Path, judge: VecEnv, normal: VecNormalize, stop: StopRequest) -> None:
+    def __init__(self, args: Train, out: Path, held_out: VecEnv, normal: VecNormalize, stop: StopRequest) -> None:
         super().__init__()
-        self._args, self._out, self._judge, self._normal, self._stop = args, out, judge, normal, stop
+        self._args, self._out, self._held_out, self._normal, self._stop = args, out, held_out, normal, stop
         self._points: list[dict[str, Any]] = []
         self._began = time.monotonic()
         self._progress = Progress(console=Console(file=sys.stderr))
@@ -301,7 +303,9 @@ class CurveCallback(BaseCallback):
     def _evaluate(self) -> None:
         """Add a point to the curve, and write curve and weights."""
         save_policy(self._out / WEIGHTS, self.model, self._normal)  # type: ignore[arg-type]  # made by `train`
-        score = play(self._judge, Held(load_player(self._out / WEIGHTS, self._judge)), range(self._args.eval_episodes))
+        score = play(
+            self._held_out, Held(load_player(self._out / WEIGHTS, self._held_out)), range(self._args.eval_episodes)
+        )
         minutes, steps = (time.monotonic() - self._began) / 60, HELD * self.num_timesteps
         self._points.append({"steps": steps, "minutes": round(minutes, 2), **asdict(score)})
         write_json(self._out / CURVE, self._points)
@@ -328,7 +332,7 @@ def train(args: Train) -> None:
     # Rewards are scaled by the spread of the discounted return, and not clipped: a success is far from the others.
     normal = VecNormalize(rows, clip_obs=CLIP_OBS, clip_reward=np.inf, gamma=GAMMA, epsilon=STD_FLOOR)
     model = PPO("MlpPolicy", normal, seed=args.seed, device="cpu", policy_kwargs=NETWORK, **PPO_SETTINGS)
-    normal.seed((args.seed + 1) * TRAINING_SEEDS)  # PPO passes its own seed, which the judged episodes have too
+    normal.seed((args.seed + 1) * TRAINING_SEEDS)  # PPO passes its own seed, which the evaluated episodes have too
     try:
         with stop_requests() as stop:
             model.learn(args.steps // HELD, callback=CurveCallback(args, out, playing, normal, stop))
@@ -337,7 +341,7 @@ def train(args: Train) -> None:
         playing.close()
 
 
-def judge(args: Judge) -> None:
+def evaluate(args: Evaluate) -> None:
     """Write the scores of a trained policy and of those that it is compared with."""
     if not (args.run / WEIGHTS).is_file():
         raise ConfigError(f"{args.run} holds no {WEIGHTS}: give the folder of a run of 'train'")
@@ -410,10 +414,18 @@ def _draw(labels: list[str], curves: list[list[dict[str, Any]]], others: dict[st
     print(picture)
 
 
+def _present_words(words: Sequence[str]) -> list[str]:
+    """Return the command line with `judge`, as `evaluate` was called before, under its present name."""
+    if words[:1] == ["judge"]:
+        print("judge is evaluate now; the former name goes with the next release", file=sys.stderr)
+        return ["evaluate", *words[1:]]
+    return list(words)
+
+
 def main() -> None:
     """Parse the command line and run; one line for what a user can mend."""
-    run: dict[type, Callable[[Any], None]] = {Train: train, Judge: judge, Report: report}
-    args = tyro.cli(Train | Judge | Report)
+    run: dict[type, Callable[[Any], None]] = {Train: train, Evaluate: evaluate, Report: report}
+    args = tyro.cli(Train | Evaluate | Report, args=_present_words(sys.argv[1:]))
     try:
         with torch_threads(1):  # the workers need the cores
             run[type(args)](args)

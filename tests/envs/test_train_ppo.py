@@ -14,7 +14,20 @@ pytest.importorskip("stable_baselines3", reason="Stable-Baselines3 is not instal
 sys.path.insert(0, str(Path(__file__).resolve().parents[2] / "scripts" / "examples"))
 
 import train_ppo
-from train_ppo import CURVE, HELD, SETTINGS, WEIGHTS, Held, IdlePlayer, Judge, Train, judge, load_player, play, train
+from train_ppo import (
+    CURVE,
+    HELD,
+    SETTINGS,
+    WEIGHTS,
+    Evaluate,
+    Held,
+    IdlePlayer,
+    Train,
+    evaluate,
+    load_player,
+    play,
+    train,
+)
 
 from manicm_ms.envs.vec_env import make_vec
 from manicm_ms.errors import ConfigError
@@ -62,9 +75,9 @@ def test_a_run_is_never_overwritten(run):
     assert (run / WEIGHTS).read_bytes() == before
 
 
-def test_only_a_run_can_be_judged(tmp_path):
+def test_only_a_run_can_be_evaluated(tmp_path):
     with pytest.raises(ConfigError, match=WEIGHTS):
-        judge(Judge(tmp_path))
+        evaluate(Evaluate(tmp_path))
 
 
 def test_a_stop_keeps_curve_and_weights(tmp_path, monkeypatch):
