@@ -7,6 +7,7 @@ import importlib.metadata
 import importlib.util
 import os
 import pkgutil
+import sys
 import traceback
 import warnings
 from collections.abc import Callable, Iterable, Sequence
@@ -21,8 +22,10 @@ TASKS = "manicm_ms.tasks"
 """The package of tasks, which users add theirs to. It is named here alone and imported at the first look-up: tasks
 import the registries in which they enter themselves, and what holds a registry imports no task."""
 
-_entered: list[tuple[Registry[Any], str]] = []
-"""Registry and name of every entry, in order: what a module had entered before it failed is taken out again."""
+_entered: list[tuple[Registry[Any], str, str]] = []
+"""Registry, name and module of every entry: what a module had entered before it failed is taken out again."""
+_importing: list[str] = []
+"""Modules that are not ours and are being imported just now, the innermost last."""
 _left_out: set[str] = set()
 """Modules that cannot be imported: several registries discover the same package, but one warning is enough."""
 
@@ -57,12 +60,15 @@ class Registry(Generic[T]):
             tags: groups that it belongs to.
             former: names that it has, or had, elsewhere; asking for one of them is answered by `name`.
         """
+        module = _registering_module()
+        if module in _importing:
+            self._discover_own()  # else a name of ours would be free, and our own module would be refused later
         if name in self._entries:
             raise DuplicateNameError(self.kind, name)
         self._entries[name] = entry
         self._tags[name] = frozenset(tags)
         self._former.update(dict.fromkeys(former, name))
-        _entered.append((self, name))
+        _entered.append((self, name, module))
         return entry
 
     def _remove(self, name: str) -> None:
@@ -106,16 +112,22 @@ class Registry(Generic[T]):
         return next((name for name, known in self._entries.items() if known is entry), None)
 
     def _discover(self) -> None:
+        package = self._package
+        self._discover_own()
+        if package is not None:
+            for name, ours in _modules(package):
+                if not ours:
+                    _import_or_leave_out(name)
+            if self._outside is None:
+                self._discover_outside()
+
+    def _discover_own(self) -> None:
         if self._package is None:
             return
         package, self._package = self._package, None
         for name, ours in _modules(package):
             if ours:
                 importlib.import_module(name)
-            else:
-                _import_or_leave_out(name)
-        if self._outside is None:
-            self._discover_outside()
 
     def _discover_outside(self) -> None:
         """Import what is not ours: modules of the user's own, and those of installed packages."""
@@ -143,16 +155,26 @@ def _import_or_leave_out(name: str) -> None:
     """Import a module that is not ours; one that cannot be imported is named in one line, once, and left out."""
     if name in _left_out:
         return
-    before = len(_entered)
+    _importing.append(name)
     try:
         importlib.import_module(name)
-    except (Exception, SystemExit) as error:  # whatever it is, it is that file's: the other tasks go on
-        for registry, entry in _entered[before:]:
-            registry._remove(entry)
-        del _entered[before:]
+    except (Exception, SystemExit) as error:  # whatever it is, it is that file's: the others go on
+        for item in [item for item in _entered if item[2] == name]:
+            item[0]._remove(item[1])
+            _entered.remove(item)
         _left_out.add(name)
         file, line, what = where_it_failed(error, _origin(name))
         warnings.warn(f"{file}, line {line}: {what}; what it registers is left out", TaskWarning, stacklevel=2)
+    finally:
+        _importing.pop()
+
+
+def _registering_module() -> str:
+    """Return the name of the module whose code calls a registry."""
+    frame = sys._getframe(1)
+    while frame.f_back is not None and frame.f_globals.get("__name__") == __name__:
+        frame = frame.f_back
+    return str(frame.f_globals.get("__name__"))
 
 
 def _origin(name: str) -> str:

@@ -84,3 +84,48 @@ def test_a_method_outside_the_repository_is_trained_loaded_and_timed(method_fold
     config = json.loads((tmp_path / "bc" / "config.json").read_text())
     assert config["config"]["head"] == {"name": "regression", "width": 16}
     assert config["config"]["backbone"] is None
+
+
+TAKES = """from manicm_ms.policies.heads.head import HEADS, TrainableHead
+@HEADS.register("rnn")
+class Mine(TrainableHead): pass
+"""
+BREAKS = """from manicm_ms.policies.heads.gmm import GMMHead
+from manicm_ms.policies.methods import METHODS
+from manicm_ms.training.objectives.head_loss import HeadObjective
+METHODS.add("half_done", METHODS.get_registered("dp3"))
+raise RuntimeError("not ready")
+"""
+LOOKS = """
+from pathlib import Path
+from manicm_ms.envs.simulator import ENVS
+from manicm_ms.policies.checkpoint import load_checkpoint
+from manicm_ms.policies.heads.head import HEADS
+from manicm_ms.policies.methods import METHODS
+from manicm_ms.training.objectives.objective import OBJECTIVES
+assert "ur3e/slide-block" in ENVS.names()
+assert HEADS.get("rnn").__module__ == "manicm_ms.policies.heads.rnn"
+assert {"gmm", "rnn", "diffusion", "consistency"} == set(HEADS.names())
+assert {"dp3", "bc_gmm_3d"} <= set(METHODS.names()) and "half_done" not in METHODS.names()
+assert OBJECTIVES.names() == ("plain", "averaged")
+print(load_checkpoint(Path(CHECKPOINT)).name)
+"""
+
+
+@pytest.mark.parametrize("first", ["ENVS", "METHODS", "HEADS"])
+def test_a_file_that_takes_a_name_of_ours_or_breaks_costs_what_is_ours_nothing(first, tmp_path):
+    """Whichever registry comes to the user's files first, and whatever of ours is imported by then."""
+    (tmp_path / "takes.py").write_text(TAKES)
+    (tmp_path / "breaks.py").write_text(BREAKS)
+    student = GUIDE.parents[2] / "checkpoints" / "slide_block" / "student"
+    lines = LOOKS.replace("CHECKPOINT", repr(str(student))).splitlines()
+    lines.sort(key=lambda line: not (f" {first}" in line and line.startswith("from")))
+    lines.insert(1, f"{first}.names()")
+    done = subprocess.run(
+        [sys.executable, "-c", "\n".join(lines)], cwd=tmp_path, capture_output=True, text=True, check=False,
+        env=os.environ | {"MANICM_MS_TASKS": str(tmp_path), "OMP_NUM_THREADS": "1"},
+    )  # fmt: skip
+    assert done.returncode == 0, done.stdout + done.stderr
+    assert done.stdout.strip() == "manicm"
+    assert done.stderr.count("takes.py, line 2: DuplicateNameError: head 'rnn' is registered twice") == 1
+    assert done.stderr.count("breaks.py, line 5: RuntimeError: not ready") == 1

@@ -184,7 +184,7 @@ _MADE_FROM_TEACHER = {
 
 def method_names() -> tuple[str, ...]:
     """Return the names of all methods: what is trained on demonstrations, and what is made of a teacher."""
-    from manicm_ms.training.objectives import trained_methods
+    from manicm_ms.training.objectives.objective import trained_methods
 
     return (*trained_methods(), *_MADE_FROM_TEACHER)
 

@@ -85,7 +85,7 @@ def _run(arguments: list[str]) -> int | None:
             from manicm_ms.cli import bench
 
             return bench.run(rest)
-        if name in WITH_PRESET:
+        if name == "distill":
             from manicm_ms.cli.training import present_flags
 
             rest = present_flags(rest)

@@ -113,7 +113,9 @@ def require_made_for(spec: EnvSpec, policies: Sequence[EvaluatedPolicy]) -> None
 
 
 def _called(evaluated: EvaluatedPolicy) -> str:
-    return f"{'policy' if evaluated.role == OTHER else 'checkpoint'} {evaluated.checkpoint}"
+    from manicm_ms.evaluation.user_policy import UserPolicy
+
+    return f"{'policy' if isinstance(evaluated.policy, UserPolicy) else 'checkpoint'} {evaluated.checkpoint}"
 
 
 def checkpoint_digest(folder: str) -> str:

@@ -56,10 +56,10 @@ class ActionPolicy(Policy):
         normalizer_config: how the normalizer is fitted.
         encoder: normalised observations to features.
         head: features to normalised chunks.
-        normalizer: of the encoder's keys and of `action`; a fresh one where None.
+        normalizer: of its keys and of `action`; a fresh one where None.
 
     Attributes:
-        keys: observations that it reads.
+        keys: observations that it reads: the encoder's and the transforms'.
     """
 
     def __init__(
@@ -74,10 +74,11 @@ class ActionPolicy(Policy):
         normalizer: Normalizer | None = None,
     ) -> None:
         super().__init__()
-        self.name, self.spec, self.chunk, self.keys = name, spec, chunk, encoder.keys
+        self.name, self.spec, self.chunk = name, spec, chunk
+        self.keys = tuple(dict.fromkeys([*encoder.keys, *(key for t in transforms.values() for key in t.reads)]))
         self.transforms = torch.nn.ModuleDict(transforms)
         self.normalizer_config = normalizer_config
-        self.normalizer = normalizer if normalizer is not None else Normalizer(_channels(spec, encoder.keys))
+        self.normalizer = normalizer if normalizer is not None else Normalizer(_channels(spec, self.keys))
         self.encoder, self.head = encoder, head
 
     @property
@@ -206,7 +207,7 @@ def read_parts(config: Nested) -> Parts:
     """Return what a configuration says; arguments and errors as those of `build_policy`."""
     for key in config:
         if key not in SECTIONS:
-            raise UnknownNameError("configuration key", key, SECTIONS)
+            raise UnknownNameError("configuration key", key, (*SECTIONS, "chunk", "training"))
     inputs = config.get("inputs") or {}
     if not isinstance(inputs, Mapping):
         raise ConfigError(f"inputs takes the fields of each transform, as in inputs.points.max_points; got {inputs!r}")
@@ -216,10 +217,11 @@ def read_parts(config: Nested) -> Parts:
         transforms[key] = kind, section(kind.Config, _mapping(fields, f"inputs.{key}"), f"inputs.{key}")
     encoder, head = _part(ENCODERS, config, "encoder"), _part(HEADS, config, "head")
     backbone = _part(BACKBONES, config, "backbone") if config.get("backbone") else None
+    called = config["head"][NAME]
     if head[0].needs_backbone and backbone is None:
-        raise ConfigError(f"this head needs a backbone: name one of {', '.join(BACKBONES.names())}")
+        raise ConfigError(f"the head {called!r} needs a backbone: name one of {', '.join(BACKBONES.names())}")
     if backbone is not None and not head[0].needs_backbone:
-        raise ConfigError("this head runs no backbone: leave the section backbone out")
+        raise ConfigError(f"the head {called!r} runs no backbone: set backbone=null, and no field of it")
     fitted = section(NormalizerConfig, _mapping(config.get("normalizer") or {}, "normalizer"), "normalizer")
     return Parts(transforms, fitted, encoder, backbone, head)
 
@@ -239,6 +241,13 @@ def build_policy(name: str, config: Nested, spec: EnvSpec, chunk: ChunkSpec) -> 
         ConfigError: a value is of another type or out of range, or parts do not fit together, `spec` or `chunk`.
     """
     parts = read_parts(config)
+    try:
+        return _built(name, parts, spec, chunk)
+    except RuntimeError as error:  # of the allocator, as a rule: sizes that no machine holds
+        raise ConfigError(f"{name} cannot be built with these sizes: {' '.join(str(error).split())}") from error
+
+
+def _built(name: str, parts: Parts, spec: EnvSpec, chunk: ChunkSpec) -> ActionPolicy:
     transforms = {key: kind(fields, spec) for key, (kind, fields) in parts.inputs.items()}
     encoder_kind, encoder_fields = parts.encoder
     encoder = encoder_kind(encoder_fields, spec, chunk)
@@ -255,7 +264,8 @@ def _part(registry: Registry[Any], config: Nested, key: str) -> tuple[Any, Any]:
     """Return the class that a section names and its configuration."""
     values = dict(_mapping(config.get(key) or {}, key))
     if NAME not in values:
-        raise ConfigError(f"{key} lacks the key {NAME}: name one of {', '.join(registry.names())}")
+        fields = f": there is none that {', '.join(values)} could be of" if values else ""
+        raise ConfigError(f"{key} has no {NAME}{fields}; name one of {', '.join(registry.names())}")
     name = values.pop(NAME)
     if not isinstance(name, str):
         raise ConfigError(f"{key}.{NAME} takes a word, got {name!r}")

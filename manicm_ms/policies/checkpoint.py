@@ -64,7 +64,7 @@ def save_checkpoint(
         NoSpaceError: the disk is full; the old checkpoint stays.
     """
     folder, policy = Path(folder), _unwrapped(policy)
-    if HEADS.name_of(type(policy.head)) is None:
+    if HEADS.name_of(type(_unwrapped_part(policy.head))) is None:
         raise CheckpointError(f"{policy.name} shares the weights of another policy: save that one")
     if dtype not in WEIGHTS_DTYPES:
         raise ConfigError(f"unknown checkpoint dtype {dtype!r}: use {', '.join(WEIGHTS_DTYPES)}")
@@ -174,6 +174,10 @@ def _unwrapped(policy: nn.Module) -> ActionPolicy:
     if not isinstance(policy, ActionPolicy):
         raise CheckpointError(f"a {type(policy).__name__} is no policy of this package: save the policy that it wraps")
     return policy
+
+
+def _unwrapped_part(part: nn.Module) -> Any:
+    return getattr(part, _COMPILED, part)
 
 
 def _stored(policy: ActionPolicy, dtype: torch.dtype) -> dict[str, Tensor]:

@@ -13,11 +13,13 @@ command line, in a YAML file and in a checkpoint's config.json.
 from __future__ import annotations
 
 import copy
+import math
 import re
 from collections.abc import Mapping, Sequence
 from dataclasses import MISSING, fields
 from pathlib import Path
-from typing import Any, TypeVar, get_args, get_origin, get_type_hints
+from types import UnionType
+from typing import Any, Literal, TypeVar, Union, get_args, get_origin, get_type_hints
 
 import yaml
 
@@ -25,6 +27,8 @@ from manicm_ms.errors import ConfigError, UnknownNameError
 
 NAME = "name"
 """Key of a section that says which part its other keys are of."""
+PARTS = ("encoder", "backbone", "head")
+"""Sections that have one."""
 
 Config = TypeVar("Config")
 Nested = Mapping[str, Any]
@@ -34,17 +38,17 @@ Nested = Mapping[str, Any]
 def merged(base: Nested, changes: Nested) -> dict[str, Any]:
     """Return `base` with `changes`, section by section; both stay as they are.
 
-    A section that names another part than before begins anew: fields of the U-Net mean nothing to a mixer. A section
-    that is a text instead of a mapping is that part's name.
+    A section that names another part than before begins anew: fields of the U-Net mean nothing to a mixer. A text in
+    place of a part's section (`PARTS`) is that part's name.
     """
     result = copy.deepcopy(dict(base))
     for key, value in changes.items():
         old = result.get(key)
-        if isinstance(value, str) and isinstance(old, Mapping):
-            value = {NAME: value}
+        if key in PARTS:
+            old, value = ({NAME: v} if isinstance(v, str) else v for v in (old, value))
         if isinstance(value, Mapping) and isinstance(old, Mapping):
-            same = value.get(NAME, old.get(NAME)) == old.get(NAME)
-            result[key] = merged(old if same else {}, value)
+            other = NAME in value and NAME in old and value[NAME] != old[NAME]
+            result[key] = merged({} if other else old, value)
         else:
             result[key] = copy.deepcopy(value)
     return result
@@ -119,6 +123,16 @@ class PlainLoader(yaml.SafeLoader):
             raise ConfigError(f"line {line} has the tag {event.tag}: write plain values")
         return super().compose_node(parent, index)
 
+    def construct_mapping(self, node: Any, deep: bool = False) -> dict[Any, Any]:
+        """Return a mapping; refuse keys that are no words, and one that stands there twice."""
+        keys = [self.construct_object(key, deep=True) for key, _ in node.value]
+        line = node.start_mark.line + 1
+        if bad := [key for key in keys if not isinstance(key, str)]:
+            raise ConfigError(f"the mapping that begins in line {line} has the key {bad[0]!r}: keys are words")
+        if twice := [key for k, key in enumerate(keys) if key in keys[:k]]:
+            raise ConfigError(f"the mapping that begins in line {line} has the key {twice[0]!r} twice")
+        return super().construct_mapping(node, deep=deep)
+
 
 # YAML 1.1 takes 1e-3 for a word; users, and YAML 1.2, for a number.
 PlainLoader.add_implicit_resolver(
@@ -140,13 +154,13 @@ def read_yaml(path: Path) -> dict[str, Any]:
     except (OSError, UnicodeDecodeError) as error:
         raise ConfigError(f"{path} cannot be read ({error}): name a YAML file") from error
     except yaml.YAMLError as error:
-        raise ConfigError(f"{path} is no YAML ({' '.join(str(error).split())}): correct it") from error
+        raise ConfigError(f"{path} is not valid YAML ({' '.join(str(error).split())}): correct it") from error
     except ConfigError as error:
         raise ConfigError(f"{path}: {error}") from error
     except RecursionError as error:
         raise ConfigError(f"{path} is nested too deeply: write sections and their fields") from error
-    if not isinstance(value, dict) or not all(isinstance(key, str) for key in value):
-        raise ConfigError(f"{path} holds no sections: write, for example, `head: {{num_inference_steps: 4}}`")
+    if not isinstance(value, dict):
+        raise ConfigError(f"{path} has no sections: write, for example, `head: {{num_inference_steps: 4}}`")
     return value
 
 
@@ -174,34 +188,50 @@ def section(kind: type[Config], values: Nested, path: str) -> Config:
 
 
 def typed(value: Any, hint: Any, path: str) -> Any:
-    """Return `value` as the annotation `hint` has it; raise ConfigError where it is something else."""
-    options = get_args(hint) if get_origin(hint) not in (tuple, None) else (hint,)
-    for option in options:
-        fitting = _fitting(value, option)
-        if fitting is not None or (value is None and option in (type(None), None)):
+    """Return `value` as the annotation `hint` has it; raise ConfigError where it is something else.
+
+    Known are bool, int, float, str, `Literal`, lists and tuples of them, and unions with None or each other.
+    """
+    for option in get_args(hint) if get_origin(hint) in (Union, UnionType) else (hint,):
+        fits, fitting = _fitting(value, option)
+        if fits:
             return fitting
     raise ConfigError(f"{path} takes {_called(hint)}, got {value!r}")
 
 
-def _fitting(value: Any, hint: Any) -> Any:
-    """Return `value` as the plain type or tuple `hint`, or None where it does not fit."""
-    if get_origin(hint) is tuple:
-        inner = get_args(hint)[0]
-        items = [_fitting(item, inner) for item in value] if isinstance(value, list | tuple) else [None]
-        if not isinstance(value, list | tuple) and (one := _fitting(value, inner)) is not None:
-            items = [one]  # `--set backbone.down_dims=64` names one stage
-        return None if any(item is None for item in items) else tuple(items)
+def _fitting(value: Any, hint: Any) -> tuple[bool, Any]:
+    """Return whether `value` fits an annotation that is no union, and the value as that type."""
+    if hint in (None, type(None)):
+        return value is None, None
+    if get_origin(hint) is Literal:
+        return value in get_args(hint), value
+    if get_origin(hint) in (tuple, list):
+        return _fitting_sequence(value, get_origin(hint), get_args(hint))
     if hint is float and isinstance(value, int) and not isinstance(value, bool):
-        return float(value)
-    if isinstance(hint, type) and isinstance(value, hint) and (hint is bool or not isinstance(value, bool)):
-        return value
-    return None
+        value = float(value)
+    if isinstance(value, float) and not math.isfinite(value):
+        return False, None
+    return isinstance(hint, type) and isinstance(value, hint) and (hint is bool or not isinstance(value, bool)), value
+
+
+def _fitting_sequence(value: Any, kind: type, inner: tuple[Any, ...]) -> tuple[bool, Any]:
+    items = value if isinstance(value, list | tuple) else [value]  # `--set backbone.down_dims=64` names one stage
+    any_length = kind is list or inner[-1] is Ellipsis
+    hints = [inner[0]] * len(items) if any_length else list(inner)
+    if len(hints) != len(items):
+        return False, None
+    each = [_fitting(item, hint) for item, hint in zip(items, hints, strict=True)]
+    return all(fits for fits, _ in each), kind(item for _, item in each)
 
 
 def _called(hint: Any) -> str:
-    if get_origin(hint) is tuple:
-        return f"several values, each {_called(get_args(hint)[0])}"
+    if get_origin(hint) in (tuple, list):
+        inner = get_args(hint)
+        count = "several values" if get_origin(hint) is list or inner[-1] is Ellipsis else f"{len(inner)} values"
+        return f"{count}, each {_called(inner[0])}"
+    if get_origin(hint) is Literal:
+        return f"one of {', '.join(map(str, get_args(hint)))}"
     if args := get_args(hint):
         return " or ".join(_called(a) for a in args)
-    names = {int: "a whole number", float: "a number", str: "a word", bool: "true or false", type(None): "null"}
+    names = {int: "a whole number", float: "a finite number", str: "a word", bool: "true or false", type(None): "null"}
     return names.get(hint, getattr(hint, "__name__", str(hint)))

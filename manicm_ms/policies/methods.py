@@ -15,7 +15,7 @@ import torch
 from manicm_ms.errors import ConfigError
 from manicm_ms.policies.action_policy import ActionPolicy, NormalizerConfig, build_policy, read_parts
 from manicm_ms.policies.backbones.backbone import BACKBONES
-from manicm_ms.policies.configuration import NAME, Nested, merged, section
+from manicm_ms.policies.configuration import NAME, PARTS, Nested, merged, section
 from manicm_ms.policies.encoders.encoder import ENCODERS
 from manicm_ms.policies.encoders.transform import TRANSFORMS
 from manicm_ms.policies.heads.consistency import ConsistencyHead
@@ -59,6 +59,21 @@ class Method:
     size_chunks: Mapping[str, ChunkSpec] = field(default_factory=dict)
     inputs: Mapping[str, Nested] = field(default_factory=dict)
     optimizer: Nested = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        for key in PARTS:
+            part = getattr(self, key)
+            described = _described(part)
+            optional = key == "backbone" and part is None
+            if not optional and not (isinstance(described, Mapping) and isinstance(described.get(NAME), str)):
+                raise ConfigError(
+                    f"{key} of a method is a name, or a mapping with {NAME!r} and its fields; got {part!r}"
+                )
+        if not all(isinstance(fields, Mapping) for fields in self.inputs.values()):
+            raise ConfigError(f"inputs of a method is a mapping of transforms to their fields, got {self.inputs!r}")
+        for lengths in (self.chunk, *self.size_chunks.values()):
+            if not isinstance(lengths, ChunkSpec):
+                raise ConfigError(f"chunk of a method is a ChunkSpec, got {lengths!r}")
 
     def chunk_of(self, size: str, changes: Nested | None = None) -> ChunkSpec:
         """Return To, Tp, Ta with a size, with fields of `changes` in place of its own.
@@ -186,7 +201,7 @@ METHODS.add(
 METHODS.add(
     "pocket_dp3",
     Method(
-        sentence="Pocket DP3: DP3 with a mixer of 2.5 million weights for a U-Net, evaluated twice a decision.",
+        sentence="Pocket DP3: a mixer of 2.5 million weights in place of the U-Net, evaluated twice a decision.",
         reference="arXiv:2601.22018, arXiv:2605.01581",
         encoder="dp3",
         backbone="mixer",

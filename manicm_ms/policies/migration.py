@@ -1,4 +1,4 @@
-"""Checkpoints and training states of format 1, told in the words of format 2.
+"""Checkpoints and training states of format 1, translated to format 2.
 
 Format 1 had one flat section `network`, with fields of the U-Net, the encoder, the cloud's frame and the choice of
 points, beside `diffusion` and `consistency`; its tensors lay under `network.`.

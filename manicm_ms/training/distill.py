@@ -18,7 +18,7 @@ from manicm_ms.spec import EnvSpec, require_compatible
 from manicm_ms.training.demonstrations import Data, read_demos
 from manicm_ms.training.features import encode_dataset
 from manicm_ms.training.loop import Batches
-from manicm_ms.training.objectives import DISTILLATIONS, PolicyObjective
+from manicm_ms.training.objectives.objective import DISTILLATIONS, PolicyObjective
 from manicm_ms.training.presets import StudentPreset
 from manicm_ms.training.session import Session
 from manicm_ms.training.settings import preset_identity

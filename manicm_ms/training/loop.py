@@ -171,7 +171,9 @@ class _Training:
         if saved is None:
             return
         tensors, meta = saved
-        changing = present_tensors(_under("objective.", tensors))  # a run may have been begun by the former release
+        changing = _under("objective.", tensors)
+        if not changing.keys() <= self.objective.state_dict().keys():  # begun by the former release?
+            changing = present_tensors(changing)
         missing, unexpected = self.objective.load_state_dict(changing, strict=False)
         unsaved = [k for k in missing if not k.startswith(self.objective.constant)]
         if unsaved or unexpected:

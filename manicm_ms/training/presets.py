@@ -109,8 +109,9 @@ def _with_changes(preset: Preset, changes: Nested) -> Preset:
         if name not in known:
             raise UnknownNameError("configuration key", f"{TRAINING}.{name}", [f"{TRAINING}.{k}" for k in known])
     values = {name: typed(value, hints[name], f"{TRAINING}.{name}") for name, value in training.items()}
-    if "steps" in values and "epochs" not in values:
-        values["epochs"] = None
+    for one, other in (("steps", "epochs"), ("epochs", "steps")):
+        if values.get(one) is not None and other not in values:
+            values[other] = None
     if isinstance(preset, TeacherPreset):
         values["changes"] = merged(preset.changes, rest)
     elif rest:
@@ -126,7 +127,7 @@ def _lengths(section_: Any) -> Nested:
 
 def preset_for(method: str, name: str) -> TeacherPreset:
     """Return the preset called `name` with what the method itself says of the optimiser."""
-    return replace(TEACHER_PRESETS.get(name), **METHODS.get(method).optimizer)
+    return TEACHER_PRESETS.get(name).with_changes({TRAINING: METHODS.get(method).optimizer})
 
 
 TEACHER_PRESETS: Registry[TeacherPreset] = Registry("teacher preset")

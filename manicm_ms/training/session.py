@@ -21,7 +21,7 @@ from manicm_ms.policies.checkpoint import read_manifest, save_checkpoint
 from manicm_ms.training.demonstrations import Demos
 from manicm_ms.training.device import make_fabric, resolve_precision
 from manicm_ms.training.loop import Batches, FitResult, Snapshots, fit
-from manicm_ms.training.objectives import PolicyObjective
+from manicm_ms.training.objectives.objective import PolicyObjective
 from manicm_ms.training.optim import FitConfig
 from manicm_ms.training.run_folder import RunFolder, open_run, snapshot_folder, training_folder
 

@@ -1,4 +1,4 @@
-"""What a training is told, in other words: as options of the command line, and as what tells one run from another."""
+"""Options of the command line for configuration keys, and the identity of a run."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ from collections.abc import Mapping
 from dataclasses import asdict, fields
 from typing import Any
 
-from manicm_ms.policies.action_policy import NormalizerConfig
+from manicm_ms.policies.action_policy import NormalizerConfig, read_parts
 from manicm_ms.policies.backbones.backbone import BACKBONES
 from manicm_ms.policies.configuration import NAME, Nested, lookup
 from manicm_ms.policies.encoders.encoder import ENCODERS
@@ -54,12 +54,14 @@ def _defaults(config: Nested) -> dict[str, Any]:
     for key, registry in (("encoder", ENCODERS), ("backbone", BACKBONES), ("head", HEADS)):
         if config.get(key):
             kinds[key] = registry.get(config[key][NAME]).Config
-    kinds |= {f"inputs.{name}": TRANSFORMS.get(name).Config for name in config["inputs"]}
+    kinds |= {f"inputs.{name}": TRANSFORMS.get(name).Config for name in config["inputs"] or {}}
     return {f"{key}.{f.name}": f.default for key, kind in kinds.items() for f in fields(kind)}
 
 
 _ADDED_LATER = {"acting_points": "prefix", "training_points": "random", "min_state_range": 0.0}
 """Options that came after runs were made without them, with what those runs did."""
+_FIRST_METHODS = ("dp3", "simple_dp3")
+"""Methods that runs were made with before there was a table: their identity says how a run departs from the row."""
 _FORMER = {"ema_decay": "mu", "solver_stride": "skip"}
 """Fields by the names that they had when the first runs were made."""
 
@@ -67,8 +69,8 @@ _FORMER = {"ema_decay": "mu", "solver_stride": "skip"}
 def preset_identity(preset: FitConfig, method: str | None = None) -> dict[str, Any]:
     """Return what tells one preset from another, JSON values.
 
-    It is told in the words of the first release: fields that were flat then are flat, what came later is left out where
-    it says what was done before. So older runs still are the same run: they go on, or are found finished.
+    It uses the field names of the first release: what was flat then is flat, and what came later is left out where it
+    says what was done before. So older runs keep their identity: they go on, or are found finished.
 
     Args:
         preset: of a training or a distillation.
@@ -85,8 +87,20 @@ def _policy_identity(preset: TeacherPreset, method: str) -> dict[str, Any]:
     flags = _flags_of(config)
     if _lists(flags["down_dims"]) == _lists(_flags_of(published)["down_dims"]):
         flags["down_dims"] = None  # the method's own
-    rest = _without_flags(config)
-    return flags if rest == _without_flags(published) else {**flags, "configuration": rest}
+    if method in _FIRST_METHODS and (rest := _without_flags(config)) == _without_flags(published):
+        return flags
+    if method in _FIRST_METHODS:
+        return {**flags, "configuration": rest}
+    return {CHUNK: config[CHUNK], "configuration": _resolved(config), "objective": METHODS.get(method).objective}
+
+
+def _resolved(config: Nested) -> dict[str, Any]:
+    """Return every field of every part, JSON values: it stays true whatever the row and the defaults become."""
+    parts = read_parts({key: value for key, value in config.items() if key != CHUNK})
+    named = {"encoder": parts.encoder, "backbone": parts.backbone, "head": parts.head, **parts.inputs}
+    return {key: None if part is None else [part[0].__qualname__, asdict(part[1])] for key, part in named.items()} | {
+        "normalizer": asdict(parts.normalizer)
+    }
 
 
 def _lists(value: Any) -> Any:

@@ -16,7 +16,7 @@ from manicm_ms.seeds import require_seed
 from manicm_ms.spec import ChunkSpec
 from manicm_ms.training.demonstrations import Data, Demos, read_demos
 from manicm_ms.training.loop import Batches
-from manicm_ms.training.objectives import DISTILLATIONS, OBJECTIVES, HeadObjective, PolicyObjective
+from manicm_ms.training.objectives.objective import DISTILLATIONS, OBJECTIVES, OnDemonstrations, PolicyObjective
 from manicm_ms.training.optim import PowerDecay
 from manicm_ms.training.presets import CHUNK, TeacherPreset
 from manicm_ms.training.session import Session
@@ -91,7 +91,7 @@ def train(
     return session.complete(inputs, {"data": demos.provenance}, build, snapshots)
 
 
-def objective_of(method: str) -> type[HeadObjective]:
+def objective_of(method: str) -> OnDemonstrations:
     """Return the objective of a method; raise ConfigError where it does not learn from demonstrations."""
     name = METHODS.get(method).objective
     if name in DISTILLATIONS.names():

@@ -3,8 +3,10 @@ import torch
 from policy_specs import CHUNK, TINY, make_obs, make_spec
 
 from manicm_ms.demos.stats import FieldStats
-from manicm_ms.errors import ConfigError
+from manicm_ms.errors import ConfigError, SpecMismatchError
 from manicm_ms.policies.configuration import merged
+from manicm_ms.policies.encoders.encoder import ENCODERS, Features, FeatureShape, ObsEncoder
+from manicm_ms.policies.encoders.point_net import DP3EncoderConfig
 from manicm_ms.policies.methods import make_policy
 
 
@@ -113,3 +115,40 @@ def test_least_range_holds_for_the_state_and_never_for_actions():
         torch.testing.assert_close(plain.normalizer.normalize(field, high), torch.ones_like(high))
     with pytest.raises(ConfigError, match="min_state_range"):
         made(spec, normalizer={"min_state_range": -1.0})
+
+
+class CloudOnly(ObsEncoder):
+    """Reads the cloud alone."""
+
+    Config = DP3EncoderConfig
+    keys = ("point_cloud",)
+
+    def __init__(self, config, spec, chunk):
+        super().__init__(config, spec, chunk)
+        self.layer, self.shape = torch.nn.Linear(spec.obs.point_channels, 8), FeatureShape(8)
+
+    def forward(self, obs):
+        return Features(self.layer(obs["point_cloud"].mean((1, 2))))
+
+
+@pytest.fixture
+def cloud_only():
+    ENCODERS.add("cloud_only", CloudOnly)
+    yield
+    ENCODERS._remove("cloud_only")
+
+
+@pytest.mark.usefixtures("cloud_only")
+@pytest.mark.parametrize(("frame", "keys"), [("base", ("point_cloud",)), ("tcp", ("point_cloud", "agent_pos"))])
+def test_a_policy_reads_what_its_encoder_and_its_transforms_read(frame, keys):
+    spec = make_spec()
+    config = {**TINY, "encoder": "cloud_only", "inputs": {"cloud_frame": {"frame": frame}, "points": {"max_points": 8}}}
+    policy = make_policy("simple_dp3", spec, CHUNK, config, seed=0)
+    assert policy.keys == keys
+    assert set(policy.normalizer.fields) == {*keys, "action"}
+    obs = make_obs(spec, 2)
+    generator = torch.Generator().manual_seed(0)
+    assert policy.act({key: obs[key] for key in keys}, generator=generator).shape == (2, 3, 3)
+    assert policy.encode_training(obs, generator).cond.shape == (2, 8)
+    with pytest.raises(SpecMismatchError, match="reads 'point_cloud'"):
+        policy.act({"agent_pos": obs["agent_pos"]})

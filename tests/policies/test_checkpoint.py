@@ -120,7 +120,7 @@ def test_half_precision_casts_floating_parameters_only(tmp_path, monkeypatch):
         assert extras.weight.item() == 1.0
 
 
-@pytest.mark.parametrize("part", ["policy", "head.backbone", "encoder.points"])
+@pytest.mark.parametrize("part", ["policy", "head", "head.backbone", "encoder.points"])
 def test_a_compiled_policy_is_saved_as_what_it_wraps(tmp_path, part):
     policy = student_of(teacher())
     expected = act(policy)

@@ -2,6 +2,7 @@
 
 import copy
 from dataclasses import dataclass
+from typing import Literal
 
 import pytest
 from policy_specs import CHUNK, make_spec
@@ -19,6 +20,7 @@ from manicm_ms.policies.configuration import (
 )
 from manicm_ms.policies.methods import METHODS, Method, make_policy
 from manicm_ms.spec import ChunkSpec
+from manicm_ms.training.presets import TEACHER_PRESETS
 
 BASE = {
     "head": {"name": "diffusion", "num_inference_steps": 10, "clip_range": 1.0},
@@ -122,7 +124,8 @@ def test_later_overrides_win_and_different_ones_add_up():
     words = ["head.a=1", "head.b=2", "head.a=3", "backbone.down_dims=8,16", "seed=5"]
     assert parse_overrides(words) == {"head": {"a": 3, "b": 2}, "backbone": {"down_dims": [8, 16]}, "seed": 5}
     assert parse_overrides([]) == {}
-    assert parse_overrides(["head.a=1", "head=flow", "head.b=2"]) == {"head": {"name": "flow", "b": 2}}
+    assert parse_overrides(["head.a=1", "head=flow", "head.b=2"]) == {"head": {"a": 1, "name": "flow", "b": 2}}
+    assert parse_overrides(["head=ddpm", "head.a=1", "head=flow"]) == {"head": {"name": "flow"}}
 
 
 @pytest.mark.parametrize("word", ["head.x", "=4", "head.=4", ".x=4", "head..x=4", "", " =4"])
@@ -175,14 +178,14 @@ BOMB = "a: &a [x, x, x, x, x, x, x, x, x]\n" + "".join(
         ("a: 1\nb: &x 2\n", "line 2 has an anchor or an alias: write the values out"),
         ("a: *x\n", "line 1 has an anchor or an alias"),
         (BOMB, "line 1 has an anchor"),
-        ("- 1\n- 2\n", "holds no sections: write"),
-        ("4\n", "holds no sections"),
-        ("", "holds no sections"),
-        ("4: {a: 1}\n", "holds no sections"),
-        ("a: [1, 2\n", "is no YAML .*: correct it"),
-        ("a: 1\n b: 2\n", "is no YAML"),
-        ("a: 1\x00\n", "is no YAML"),
-        ("a: 1\n---\nb: 2\n", "is no YAML"),
+        ("- 1\n- 2\n", "has no sections: write"),
+        ("4\n", "has no sections"),
+        ("", "has no sections"),
+        ("4: {a: 1}\n", "has the key 4: keys are words"),
+        ("a: [1, 2\n", "is not valid YAML .*: correct it"),
+        ("a: 1\n b: 2\n", "is not valid YAML"),
+        ("a: 1\x00\n", "is not valid YAML"),
+        ("a: 1\n---\nb: 2\n", "is not valid YAML"),
         (b"\xff\xfe\x00a", "cannot be read .*: name a YAML file"),
         ("a: " + "[" * 5000, "nested too deeply"),
     ],
@@ -236,9 +239,9 @@ def test_a_field_without_a_default_is_needed_and_the_dataclass_may_refuse_a_valu
         ("cups", "2", "a whole number"),
         ("cups", None, "a whole number"),
         ("cups", [2], "a whole number"),
-        ("litres", "much", "a number"),
-        ("litres", False, "a number"),
-        ("litres", None, "a number"),
+        ("litres", "much", "a finite number"),
+        ("litres", False, "a finite number"),
+        ("litres", None, "a finite number"),
         ("name_of_maker", 3, "a word"),
         ("whistles", 1, "true or false"),
         ("sizes", [1, "x"], "several values, each a whole number"),
@@ -358,8 +361,8 @@ def test_a_part_that_does_not_exist_is_answered_with_the_nearest(changes, messag
         ("head.name=3", "head.name takes a word, got 3"),
         ("head.name=flow,diffusion", "head.name takes a word"),
         ("head.name=null", "head.name takes a word, got None"),
-        ("backbone=null", "this head needs a backbone: name one of "),
-        ("head=null", "head lacks the key name: name one of "),
+        ("backbone=null", "the head 'diffusion' needs a backbone: name one of "),
+        ("head=null", "head has no name; name one of "),
     ],
 )
 def test_a_section_that_is_no_section_is_refused_with_its_path(override, message):
@@ -401,3 +404,96 @@ def test_a_number_with_an_exponent_is_a_number(text, value, tmp_path):
 def test_values_out_of_range_are_refused_before_anything_is_built(override, message):
     with pytest.raises(ConfigError, match=message):
         METHODS.get("simple_dp3").configuration("smoke", parse_overrides([override]))
+
+
+def test_a_part_that_is_named_keeps_the_fields_that_are_given_before_and_after():
+    wide = {"name": "mixer", "width": 64}
+    for words in (["backbone=mixer", "backbone.width=64"], ["backbone.width=64", "backbone=mixer"]):
+        assert parse_overrides(words) == {"backbone": wide}
+        config = METHODS.get("simple_dp3").configuration("smoke", parse_overrides(words))
+        assert config["backbone"] == {**wide, "blocks": 2}
+    in_file = merged({"backbone": "mixer"}, {"backbone": {"width": 64}})
+    assert in_file == {"backbone": wide}
+    assert merged(in_file, {"backbone": "unet1d"}) == {"backbone": {"name": "unet1d"}}
+
+
+@pytest.mark.parametrize(
+    ("values", "message"),
+    [
+        ({"betas": 0.9}, "training.betas takes 2 values, each a finite number, got 0.9"),
+        ({"betas": [0.9, 0.99, 0.999]}, "training.betas takes 2 values"),
+        ({"learning_rate": float("nan")}, "training.learning_rate takes a finite number"),
+        ({"clip_norm": float("inf")}, "training.clip_norm takes a finite number or null"),
+    ],
+)
+def test_numbers_that_are_none_and_wrong_counts_are_refused(values, message):
+    with pytest.raises(ConfigError, match=message):
+        TEACHER_PRESETS.get("quick").with_changes({"training": values})
+
+
+def test_steps_and_epochs_replace_one_another():
+    passes = TEACHER_PRESETS.get("quick").with_changes({"training": {"epochs": 5}})
+    assert (passes.steps, passes.epochs) == (None, 5)
+    assert TEACHER_PRESETS.get("paper").with_changes({"training": {"steps": 5000}}).epochs is None
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("head: {nfe: 1}\nhead: {nfe: 2}\n", "begins in line 1 has the key 'head' twice"),
+        ("inputs: {1: {}}\n", "has the key 1: keys are words"),
+        ("3: {}\n", "has the key 3: keys are words"),
+    ],
+)
+def test_keys_that_are_no_words_or_stand_twice_are_refused(text, message, tmp_path):
+    (tmp_path / "a.yaml").write_text(text)
+    with pytest.raises(ConfigError, match=message):
+        read_yaml(tmp_path / "a.yaml")
+
+
+@pytest.mark.parametrize(
+    ("hint", "value", "wanted"),
+    [
+        (Literal["a", "b"], "a", "a"),
+        (list[int], [3], [3]),
+        (list[int], 3, [3]),
+        (tuple[float, float], [1, 2.5], (1.0, 2.5)),
+    ],
+)
+def test_annotations_of_a_users_part(hint, value, wanted):
+    assert typed(value, hint, "head.x") == wanted
+
+
+def test_a_literal_names_what_it_takes():
+    with pytest.raises(ConfigError, match=r"head\.x takes one of a, b, got 'c'"):
+        typed("c", Literal["a", "b"], "head.x")
+
+
+@pytest.mark.parametrize(
+    ("method", "changes", "message"),
+    [
+        ("simple_dp3", {"head": "gmm"}, "the head 'gmm' runs no backbone: set backbone=null"),
+        ("bc_gmm_3d", {"backbone": {"down_dims": [32, 64]}}, "there is none that down_dims could be of"),
+        ("simple_dp3", {"inputs": "points"}, "inputs takes the fields of each transform"),
+        ("pocket_dp3", {"backbone": {"width": 33}}, "width must be even"),
+        ("simple_dp3", {"hed": {}}, "did you mean 'head'"),
+    ],
+)
+def test_messages_say_what_to_do(method, changes, message):
+    with pytest.raises((ConfigError, UnknownNameError), match=message):
+        METHODS.get(method).configuration("smoke", changes)
+
+
+def test_sizes_that_no_machine_holds_are_one_line():
+    huge = {"backbone": {"down_dims": [8_000_000_000, 8_000_000_000]}}
+    with pytest.raises(ConfigError, match="simple_dp3 cannot be built with these sizes"):
+        make_policy("simple_dp3", make_spec(), config=huge)
+
+
+@pytest.mark.parametrize(
+    "wrong", [{"head": {"widths": 3}}, {"inputs": {"points": 3}}, {"chunk": (1, 1, 1)}, {"head": None}]
+)
+def test_a_row_of_another_form_is_refused_where_it_is_written(wrong):
+    row = {"sentence": "", "reference": "", "encoder": "dp3", "head": "gmm", "objective": "plain", "nfe": 1}
+    with pytest.raises(ConfigError, match="of a method is"):
+        Method(**{**row, "chunk": ChunkSpec(1, 1, 1), **wrong})

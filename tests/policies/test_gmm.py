@@ -43,7 +43,7 @@ def test_loss_is_the_negative_log_likelihood_written_out():
 def test_means_and_deviations_keep_within_their_bounds():
     made = policy()
     with torch.no_grad():
-        made.head.leave.bias.fill_(-50.0)
+        made.head.output.bias.fill_(-50.0)
     _, means, stds = made.head.parameters_of(features(made, 4))
     assert means.abs().max() <= 1
     assert stds.min() >= made.head.config.min_std
@@ -92,3 +92,10 @@ def test_it_learns_two_modes_and_keeps_them_apart():
 def test_values_out_of_range_are_refused(bad):
     with pytest.raises(ConfigError):
         policy(**bad)
+
+
+def test_weights_that_diverged_give_a_loss_that_is_not_finite_and_no_traceback():
+    made = policy()
+    with torch.no_grad():
+        made.head.output.weight.fill_(float("nan"))
+    assert made.head.loss(features(made, 2), torch.zeros(2, 1, 3), torch.Generator()).isnan()

@@ -11,7 +11,7 @@ from toy_policies import TimeTable, exact_factors, toy_teacher
 from manicm_ms.policies.encoders.encoder import Features
 from manicm_ms.policies.methods import student_of
 from manicm_ms.training.features import CLEAN_ACTION
-from manicm_ms.training.objectives import ConsistencyDistillation
+from manicm_ms.training.objectives.consistency import ConsistencyDistillation
 
 SIGMA = 0.2  # small enough that the exact x0 is seldom clipped
 KINDS = ("sample", "epsilon")

@@ -22,14 +22,9 @@ from manicm_ms.policies.heads.diffusion import DiffusionConfig
 from manicm_ms.policies.methods import make_policy, student_of
 from manicm_ms.spec import ChunkSpec
 from manicm_ms.training.features import CLEAN_ACTION, chosen_features, encode_dataset
-from manicm_ms.training.objectives import (
-    OBJECTIVES,
-    AveragedHeadObjective,
-    ConsistencyDistillation,
-    HeadObjective,
-    PublicConsistencyDistillation,
-    trained_methods,
-)
+from manicm_ms.training.objectives.consistency import ConsistencyDistillation, PublicConsistencyDistillation
+from manicm_ms.training.objectives.head_loss import AveragedHeadObjective, HeadObjective
+from manicm_ms.training.objectives.objective import OBJECTIVES, trained_methods
 from manicm_ms.training.optim import PowerDecay
 from manicm_ms.training.stream import step_generator, subset_generator
 

@@ -8,7 +8,7 @@ from reach_demos import reach_spec
 from manicm_ms.errors import ConfigError, UnknownNameError
 from manicm_ms.policies.methods import METHODS, make_policy
 from manicm_ms.spec import ChunkSpec
-from manicm_ms.training.presets import STUDENT_PRESETS, TEACHER_PRESETS, StudentPreset, TeacherPreset
+from manicm_ms.training.presets import STUDENT_PRESETS, TEACHER_PRESETS, StudentPreset, TeacherPreset, preset_for
 from manicm_ms.training.settings import flag_values, preset_identity
 
 
@@ -149,3 +149,21 @@ def test_keys_of_the_policy_that_do_not_fit_are_refused(changes, message):
 
     with pytest.raises((ConfigError, UnknownNameError), match=message):
         made()
+
+
+def test_the_identity_of_a_later_method_holds_what_its_row_and_parts_say(monkeypatch):
+    """Else a run of a row that was edited would be found finished."""
+    quick, row = preset_for("pocket_dp3", "quick"), METHODS.get("pocket_dp3")
+    before = preset_identity(quick, "pocket_dp3")
+    for change in ({"head": {"name": "diffusion", "num_inference_steps": 50}}, {"objective": "plain"}):
+        monkeypatch.setitem(METHODS._entries, "pocket_dp3", replace(row, **change))
+        assert preset_identity(quick, "pocket_dp3") != before
+    monkeypatch.setitem(METHODS._entries, "pocket_dp3", row)
+    assert preset_identity(quick, "pocket_dp3") == before
+    assert preset_identity(quick.with_changes({"backbone": {"width": 64}}), "pocket_dp3") != before
+
+
+def test_an_optimizer_of_a_row_is_checked_as_any_other_field(monkeypatch):
+    monkeypatch.setitem(METHODS._entries, "dp3", replace(METHODS.get("dp3"), optimizer={"lr": 1}))
+    with pytest.raises(UnknownNameError, match=r"training\.lr"):
+        preset_for("dp3", "quick")

@@ -7,7 +7,7 @@ from typing import ClassVar
 
 from torch import Tensor, nn
 
-from manicm_ms.errors import require_at_least
+from manicm_ms.errors import ConfigError, require_at_least
 from manicm_ms.policies.backbones.backbone import BACKBONES, Backbone
 from manicm_ms.policies.backbones.unet1d import SinusoidalEmbedding
 from manicm_ms.policies.encoders.encoder import Features, FeatureShape
@@ -30,7 +30,8 @@ class MixerConfig:
 
     def __post_init__(self) -> None:
         require_at_least(1, blocks=self.blocks)
-        require_at_least(4, width=self.width)
+        if self.width < 4 or self.width % 2:
+            raise ConfigError(f"width must be even and at least 4, got {self.width}")
 
 
 @BACKBONES.register("mixer")
@@ -56,23 +57,23 @@ class Mixer(Backbone):
     ) -> None:
         super().__init__(config, chunk, action_dim, features, times)
         width = config.width
-        self.enter = nn.Linear(action_dim, width)
+        self.input = nn.Linear(action_dim, width)
         self.condition = nn.Linear(features.cond, width)
         self.time_embeddings = nn.ModuleList(
             [nn.Sequential(SinusoidalEmbedding(width), _mlp(width, width)) for _ in range(times)]
         )
         self.blocks = nn.ModuleList([MixerBlock(width, chunk.horizon) for _ in range(config.blocks)])
-        self.leave = nn.Linear(width, action_dim)
+        self.output = nn.Linear(width, action_dim)
 
     def forward(self, x: Tensor, times: tuple[Tensor, ...], features: Features) -> Tensor:
         """Return the prediction (B, Tp, Da) for noisy actions x (B, Tp, Da), times, each (B,), and features."""
         cond = self.condition(features.cond)
         for embed, t in zip(self.time_embeddings, times, strict=True):
             cond = cond + embed(t)
-        x = self.enter(x)
+        x = self.input(x)
         for block in self.blocks:
             x = block(x, cond)
-        return self.leave(x)
+        return self.output(x)
 
 
 class MixerBlock(nn.Module):

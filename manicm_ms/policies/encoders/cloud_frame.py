@@ -20,17 +20,18 @@ class Frame(Protocol):
 
     Attributes:
         name: in `CLOUD_FRAMES`.
+        reads: observations that it reads.
     """
 
     name: str
+    reads: tuple[str, ...]
 
-    def __call__(self, normalized: Tensor, cloud: Tensor, agent_pos: Tensor) -> Tensor:
+    def __call__(self, normalized: Tensor, raw: Obs) -> Tensor:
         """Return the input (B, To, P, C).
 
         Args:
-            normalized: (B, To, P, C), each channel mapped to [-1, 1].
-            cloud: (B, To, P, C) in metres.
-            agent_pos: (B, To, D) in its units.
+            normalized: the cloud (B, To, P, C), each channel mapped to [-1, 1].
+            raw: `reads`, in units and frame of the environment: the cloud in metres.
         """
 
 
@@ -43,13 +44,14 @@ class BaseFrame:
     """The environment's own frame, each channel mapped to [-1, 1] over the training data."""
 
     name = "base"
+    reads: tuple[str, ...] = (POINT_CLOUD,)
 
     def __init__(self, spec: EnvSpec, scale: float) -> None:
         del spec, scale
 
-    def __call__(self, normalized: Tensor, cloud: Tensor, agent_pos: Tensor) -> Tensor:
+    def __call__(self, normalized: Tensor, raw: Obs) -> Tensor:
         """Return the normalised cloud (B, To, P, C)."""
-        del cloud, agent_pos
+        del raw
         return normalized
 
 
@@ -61,6 +63,7 @@ class TcpFrame:
     """
 
     name = "tcp"
+    reads: tuple[str, ...] = (POINT_CLOUD, AGENT_POS)
 
     def __init__(self, spec: EnvSpec, scale: float) -> None:
         if spec.tcp_indices is None:
@@ -70,8 +73,9 @@ class TcpFrame:
             )
         self.tcp, self.scale = list(spec.tcp_indices), scale
 
-    def __call__(self, normalized: Tensor, cloud: Tensor, agent_pos: Tensor) -> Tensor:
+    def __call__(self, normalized: Tensor, raw: Obs) -> Tensor:
         """Return the relative cloud (B, To, P, C)."""
+        cloud, agent_pos = raw[POINT_CLOUD], raw[AGENT_POS]
         xyz = (cloud[..., :3] - agent_pos[..., self.tcp].unsqueeze(-2)) / self.scale
         if cloud.shape[-1] == 3:
             return xyz.float()
@@ -109,7 +113,7 @@ class CloudFrame(InputTransform):
     """Gives the encoder the cloud in another frame.
 
     Args:
-        config: frame and scale; afterwards it names the frame that "auto" came to.
+        config: frame and scale; afterwards it names the frame that "auto" resolved to.
         spec: the environment.
     """
 
@@ -119,8 +123,9 @@ class CloudFrame(InputTransform):
     def __init__(self, config: CloudFrameConfig, spec: EnvSpec) -> None:
         super().__init__(config, spec)
         self.frame = CLOUD_FRAMES.get(config.frame)(spec, config.scale)
+        self.reads = self.frame.reads
         self.config = replace(config, frame=self.frame.name)
 
     def normalized(self, normalized: dict[str, Tensor], raw: Obs) -> dict[str, Tensor]:
         """See `InputTransform.normalized`."""
-        return {**normalized, POINT_CLOUD: self.frame(normalized[POINT_CLOUD], raw[POINT_CLOUD], raw[AGENT_POS])}
+        return {**normalized, POINT_CLOUD: self.frame(normalized[POINT_CLOUD], raw)}

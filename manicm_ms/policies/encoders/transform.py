@@ -24,11 +24,13 @@ class InputTransform(nn.Module, ABC):
     Attributes:
         Config: dataclass of its fields.
         sizes: name of a size ("smoke", "quick", "paper") -> fields that differ from the published ones.
-        config: the fields that it was made with, or came to.
+        reads: observations that it reads; the policy asks for them beside the encoder's.
+        config: the fields that it was made with, those resolved that the environment decides.
     """
 
     Config: ClassVar[type[Any]]
     sizes: ClassVar[Mapping[str, Mapping[str, Any]]] = {}
+    reads: tuple[str, ...] = ()
     config: Any
 
     def __init__(self, config: Any, spec: EnvSpec) -> None:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import copy
-from dataclasses import asdict, dataclass, replace
+from dataclasses import dataclass, fields, replace
 from typing import Any
 
 import numpy as np
@@ -98,7 +98,8 @@ class ConsistencyHead(ActionHead):
                 teacher's prediction.
         """
         consistency.setdefault("timestep_spacing", teacher.prediction.timestep_spacing)
-        config = ConsistencyConfig(**asdict(teacher.config), nfe=nfe, **consistency)
+        process = {f.name: getattr(teacher.config, f.name) for f in fields(DiffusionConfig)}
+        config = ConsistencyConfig(**process, nfe=nfe, **consistency)
         return cls(config, copy.deepcopy(teacher.backbone), *teacher.shape).to(teacher.alphas_cumprod.device)
 
     def with_nfe(self, nfe: int) -> ConsistencyHead:

@@ -298,7 +298,7 @@ class DiffusionHead(TrainableHead):
 
     def with_steps(self, num_inference_steps: int) -> DiffusionHead:
         """Return a head of the same weights that samples in another number of steps."""
-        return self._of_same_weights(DiffusionHead, replace(self.config, num_inference_steps=num_inference_steps))
+        return self._of_same_weights(type(self), replace(self.config, num_inference_steps=num_inference_steps))
 
     def one_step(self) -> OneStepHead:
         """Return the control of a distillation; see `OneStepHead`."""

@@ -68,7 +68,7 @@ class GMMHead(TrainableHead):
         for fan_in, fan_out in itertools.pairwise((features.cond, *config.widths)):
             layers += [nn.Linear(fan_in, fan_out), nn.ReLU()]
         self.trunk = nn.Sequential(*layers)
-        self.leave = nn.Linear(config.widths[-1], config.modes * (2 * self.outputs + 1))
+        self.output = nn.Linear(config.widths[-1], config.modes * (2 * self.outputs + 1))
 
     @property
     def nfe(self) -> int:
@@ -82,7 +82,7 @@ class GMMHead(TrainableHead):
 
     def parameters_of(self, features: Features) -> tuple[Tensor, Tensor, Tensor]:
         """Return logits (B, M) of the modes, means and standard deviations (B, M, Tp Da), normalised."""
-        raw = self.leave(self.trunk(features.cond)).float()
+        raw = self.output(self.trunk(features.cond)).float()
         sizes = [self.config.modes, self.config.modes * self.outputs, self.config.modes * self.outputs]
         logits, means, stds = raw.split(sizes, dim=-1)
         form = (len(raw), self.config.modes, self.outputs)
@@ -92,8 +92,11 @@ class GMMHead(TrainableHead):
         """Return the negative mean log-likelihood of the demonstrated chunks; see `TrainableHead.loss`."""
         del generator
         logits, means, stds = self.parameters_of(features)
-        modes = Independent(Normal(means, stds), 1)
-        return -MixtureSameFamily(Categorical(logits=logits), modes).log_prob(action.flatten(1)).mean()
+        # Unchecked: a check would wait for an accelerator at each step, and the loop names a loss that is not finite.
+        modes = Independent(Normal(means, stds, validate_args=False), 1, validate_args=False)
+        weights = Categorical(logits=logits, validate_args=False)
+        mixture = MixtureSameFamily(weights, modes, validate_args=False)
+        return -mixture.log_prob(action.flatten(1)).mean()
 
     def act(self, features: Features, noise: tuple[Tensor, ...], state: State | None) -> tuple[Tensor, State | None]:
         """Draw a mode by its weight and return a sample of it; see `ActionHead.act`.

@@ -29,7 +29,7 @@ class ActionHead(nn.Module, ABC):
         sizes: name of a size ("smoke", "quick", "paper") -> fields that differ from the published ones.
         times: numbers that it passes to its backbone with each chunk: 1 for a diffusion time.
         needs_backbone: whether it runs one.
-        role: "teacher" for what can be distilled, "student" for what has been, None for what stands alone.
+        role: "teacher" for a head that can be distilled (a `DiffusionHead`), "student" for one that was, else None.
         reads: the features that it reads, where it has no backbone.
         config: the fields that it was made with.
         backbone: its network, or None.

@@ -67,7 +67,7 @@ class RNNHead(TrainableHead):
         if features.tokens is None or features.tokens[0] != chunk.n_obs_steps:
             raise ConfigError("the head rnn reads a token for each frame, which this encoder does not give")
         self.lstm = nn.LSTM(features.tokens[1], config.width, config.layers, batch_first=True)
-        self.leave = nn.Linear(config.width, action_dim)
+        self.output = nn.Linear(config.width, action_dim)
 
     @property
     def nfe(self) -> int:
@@ -82,7 +82,7 @@ class RNNHead(TrainableHead):
     def predict(self, features: Features) -> Tensor:
         """Return an action for each frame, (B, To, Da) in [-1, 1]."""
         assert features.tokens is not None
-        return self.leave(self.lstm(features.tokens)[0]).float().tanh()
+        return self.output(self.lstm(features.tokens)[0]).float().tanh()
 
     def loss(self, features: Features, action: Tensor, generator: torch.Generator) -> Tensor:
         """Return the mean squared error over the actions of all frames; see `TrainableHead.loss`."""

@@ -1,4 +1,4 @@
-"""What is minimised: a head's own loss on demonstrations, and the distillation of a teacher."""
+"""Consistency distillation, by the corrected formula and, for comparison, by that of the public code."""
 
 from __future__ import annotations
 
@@ -10,7 +10,6 @@ import torch
 from torch import Tensor
 from torch.nn.functional import mse_loss
 
-from manicm_ms.errors import ConfigError
 from manicm_ms.policies.action_policy import ActionPolicy
 from manicm_ms.policies.encoders.encoder import Features
 from manicm_ms.policies.heads.consistency import ConsistencyHead
@@ -21,89 +20,9 @@ from manicm_ms.policies.heads.consistency_solver import (
     consistency_pair,
 )
 from manicm_ms.policies.heads.diffusion import DiffusionHead, Guess
-from manicm_ms.policies.heads.head import TrainableHead
-from manicm_ms.policies.methods import METHODS
-from manicm_ms.registry import Registry
-from manicm_ms.spec import ACTION
 from manicm_ms.training.features import CLEAN_ACTION, chosen_features
-from manicm_ms.training.loop import Objective
-from manicm_ms.training.optim import ConstantDecay, DecayRule, averaged
-
-
-class PolicyObjective(Objective):
-    """An objective whose outcome is a policy."""
-
-    @property
-    @abstractmethod
-    def outcome(self) -> ActionPolicy:
-        """What the training has made so far: the policy to act with and to save."""
-
-
-class HeadObjective(PolicyObjective):
-    """The loss of a policy's head on demonstrations; the outcome is the policy with its last weights.
-
-    Args:
-        policy: trained in place, its normalizer fitted.
-        decay: of averaged weights, for objectives that have them.
-
-    Raises:
-        ConfigError: the head does not learn from demonstrations alone.
-    """
-
-    def __init__(self, policy: ActionPolicy, decay: DecayRule) -> None:
-        super().__init__()
-        del decay
-        if not isinstance(policy.head, TrainableHead):
-            raise ConfigError(f"{policy.name} learns from a teacher: train one, and use manicm-ms distill")
-        self.policy = policy
-
-    def forward(self, batch: Mapping[str, Tensor], generator: torch.Generator) -> Tensor:
-        """Return the loss of raw windows: each observation and `action`, as `SequenceDataset.batch` gives them."""
-        features = self.policy.encode_training(batch, generator)
-        action = self.policy.normalizer.normalize(ACTION, batch[ACTION])  # (B, Tp, Da)
-        return cast(TrainableHead, self.policy.head).loss(features, action, generator)
-
-    def after_step(self) -> None:
-        """Do nothing: no weights are averaged."""
-
-    @property
-    def outcome(self) -> ActionPolicy:
-        """The policy."""
-        return self.policy
-
-
-class AveragedHeadObjective(HeadObjective):
-    """The loss of a policy's head on demonstrations; the outcome is the policy with averaged weights.
-
-    Args:
-        policy: trained in place, its normalizer fitted.
-        decay: of the averaged weights.
-    """
-
-    def __init__(self, policy: ActionPolicy, decay: DecayRule) -> None:
-        super().__init__(policy, decay)
-        self.average = averaged(policy, decay)
-
-    def after_step(self) -> None:
-        """Average the weights."""
-        self.average.update_parameters(self.policy)
-
-    @property
-    def outcome(self) -> ActionPolicy:
-        """The policy with averaged weights."""
-        return cast(ActionPolicy, self.average.module)
-
-
-OBJECTIVES: Registry[type[HeadObjective]] = Registry("objective")
-"""name -> objective of a training on demonstrations."""
-OBJECTIVES.add("plain", HeadObjective)
-OBJECTIVES.add("averaged", AveragedHeadObjective)
-
-
-def trained_methods() -> tuple[str, ...]:
-    """Return the names of the methods that learn from demonstrations."""
-    known = OBJECTIVES.names()
-    return tuple(name for name in METHODS.names() if METHODS.get(name).objective in known)
+from manicm_ms.training.objectives.objective import DISTILLATIONS, PolicyObjective
+from manicm_ms.training.optim import ConstantDecay, averaged
 
 
 class Distillation(PolicyObjective):
@@ -167,9 +86,6 @@ class Distillation(PolicyObjective):
     def outcome(self) -> ActionPolicy:
         """The student."""
         return self.student
-
-
-DISTILLATIONS: Registry[type[Distillation]] = Registry("distillation objective")
 
 
 @DISTILLATIONS.register("consistency")
