@@ -217,6 +217,8 @@ def _build(path: Path, version: int) -> ActionPolicy:
     description = _read_json(path)
     try:
         spec, config = EnvSpec.from_dict(description["env_spec"]), description["config"]
+        if not isinstance(description["policy"], str):
+            raise TypeError(f"policy is {description['policy']!r}")
         if version == 1:
             config = present_config(config)
         return build_policy(description["policy"], config, spec, ChunkSpec(**description["chunk"]))

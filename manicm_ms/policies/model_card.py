@@ -63,6 +63,9 @@ def _bullets(values: Mapping[str, Any], indent: str = "") -> list[str]:
     for key, value in values.items():
         if isinstance(value, Mapping):
             lines += [f"{indent}- {key}:", *_bullets(value, indent + "  ")]
+        elif isinstance(value, list) and value and all(isinstance(item, Mapping) for item in value):
+            numbered = {str(number): item for number, item in enumerate(value, start=1)}
+            lines += [f"{indent}- {key}:", *_bullets(numbered, indent + "  ")]
         else:
             lines.append(f"{indent}- {key}: {_short(value)}")
     return lines or [f"{indent}- not recorded"]

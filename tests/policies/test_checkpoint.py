@@ -234,6 +234,7 @@ def sign(folder):
         ({"chunk": {"n_obs_steps": 2, "horizon": "four", "n_action_steps": 3}}, "train it anew"),
         ({"env_spec": {}}, "train it anew"),
         ({"config": 3}, "train it anew"),
+        ({"policy": 3}, "train it anew"),
     ],
 )
 def test_a_configuration_that_this_version_cannot_build_is_refused(folder, change, message):

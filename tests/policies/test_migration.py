@@ -1,4 +1,4 @@
-"""Checkpoints of format 1, the shipped ones among them, act as they did under the code that wrote them."""
+"""Checkpoints of format 1, and the shipped ones, act as they did under the last code that wrote format 1."""
 
 import json
 from pathlib import Path
@@ -12,40 +12,58 @@ from manicm_ms.policies import example_observations
 from manicm_ms.policies.checkpoint import load_checkpoint, read_manifest, save_checkpoint
 from manicm_ms.policies.migration import present_config, present_tensor_name
 
-CHECKPOINTS = Path(__file__).parents[2] / "checkpoints"
-STORED = json.loads((Path(__file__).parent / "data" / "actions_of_format_1.json").read_text())
-"""Checkpoint -> actions of the last code that wrote format 1: observations of seed 7, two equal rows, noise of seed 3.
-
-Written by that code on one machine; on it they are equal to the bit, elsewhere the last digits may differ.
-"""
+DATA = Path(__file__).parent / "data"
+FORMAT_1, SHIPPED = DATA / "format_1", Path(__file__).parents[2] / "checkpoints"
+CONTROL = ", one step"
 
 
-def acted(policy, draws):
+def stored(path):
+    """Checkpoint -> actions of that code: observations of seed 7, two equal rows, noise of seed 3.
+
+    On the machine that wrote them they are equal to the bit; elsewhere the last digits may differ.
+    """
+    return json.loads(path.read_text())
+
+
+OLD, NEW = stored(FORMAT_1 / "actions.json"), stored(DATA / "shipped_actions.json")
+CASES = [(FORMAT_1, name, OLD) for name in ("teacher", "student")]
+CASES += [(SHIPPED, name, NEW) for name in NEW if not name.endswith(CONTROL)]
+
+
+def acted(policy):
     obs = {key: torch.cat([value, value]) for key, value in example_observations(policy, seed=7).items()}
-    shape = (draws, 2, policy.chunk.horizon, policy.spec.action.dim)
+    shape = (policy.noise_draws, 2, policy.chunk.horizon, policy.spec.action.dim)
     noise = torch.randn(shape, generator=torch.Generator().manual_seed(3))
     with torch_threads(1):
         return policy.act(obs, noise=noise)
 
 
-@pytest.mark.parametrize("name", [name for name in STORED if "one step" not in name])
-def test_a_shipped_checkpoint_acts_as_it_did(name, tmp_path):
-    assert read_manifest(CHECKPOINTS / name)["version"] == 1
-    policy = load_checkpoint(CHECKPOINTS / name)
-    torch.testing.assert_close(acted(policy, 1), torch.tensor(STORED[name]), rtol=0, atol=1e-5)
+@pytest.mark.parametrize(("folder", "name", "actions"), CASES, ids=[f"{f.name}/{n}" for f, n, _ in CASES])
+def test_a_checkpoint_and_its_control_act_as_they_did(folder, name, actions):
+    policy = load_checkpoint(folder / name)
+    torch.testing.assert_close(acted(policy), torch.tensor(actions[name]), rtol=0, atol=1e-5)
     control = policy.one_step()
-    assert (control is not None) == (f"{name}, one step" in STORED)
+    assert (control is not None) == (name + CONTROL in actions) == name.endswith("teacher")
     if control is not None:
-        torch.testing.assert_close(acted(control, 1), torch.tensor(STORED[f"{name}, one step"]), rtol=0, atol=1e-5)
+        torch.testing.assert_close(acted(control), torch.tensor(actions[name + CONTROL]), rtol=0, atol=1e-5)
+
+
+@pytest.mark.parametrize("name", ["teacher", "student"])
+def test_format_1_becomes_format_2_when_it_is_saved_again(name, tmp_path):
+    assert read_manifest(FORMAT_1 / name)["version"] == 1
+    policy = load_checkpoint(FORMAT_1 / name)
+    assert policy.transforms["cloud_frame"].config.frame == "tcp"
+    assert policy.transforms["points"].config.max_points == 16
+    assert policy.nfe == {"teacher": 4, "student": 2}[name]
     save_checkpoint(policy, tmp_path / "again", {})
     assert read_manifest(tmp_path / "again")["version"] == 2
-    assert torch.equal(acted(load_checkpoint(tmp_path / "again"), 1), acted(policy, 1))
+    assert torch.equal(acted(load_checkpoint(tmp_path / "again")), acted(policy))
 
 
 def test_every_shipped_pair_and_its_control_are_stored():
-    shipped = {f"{folder.parent.name}/{folder.name}" for folder in CHECKPOINTS.glob("*/*") if folder.is_dir()}
-    assert shipped == {name for name in STORED if "one step" not in name}
-    assert {f"{name}, one step" for name in shipped if name.endswith("teacher")} <= set(STORED)
+    shipped = {f"{folder.parent.name}/{folder.name}" for folder in SHIPPED.glob("*/*") if folder.is_dir()}
+    assert shipped == {name for name in NEW if not name.endswith(CONTROL)}
+    assert {name + CONTROL for name in shipped if name.endswith("teacher")} <= set(NEW)
 
 
 def test_sections_of_format_1_find_their_places():
@@ -84,8 +102,7 @@ def test_a_tensor_finds_its_place(former, present):
 
 
 def test_a_newer_format_is_refused(tmp_path):
-    name = "slide_block/student"
-    save_checkpoint(load_checkpoint(CHECKPOINTS / name), tmp_path / "new", {})
+    save_checkpoint(load_checkpoint(FORMAT_1 / "student"), tmp_path / "new", {})
     manifest = json.loads((tmp_path / "new" / "manifest.json").read_text())
     (tmp_path / "new" / "manifest.json").write_text(json.dumps(manifest | {"version": 3}))
     with pytest.raises(CheckpointError, match="format version 3 and this package reads 1 and 2"):
