@@ -240,9 +240,9 @@ def page(data: dict[str, Any]) -> str:
 Left the paper's figures ({SOURCE}: {PAPER_TRIALS} trials on a UR3e with an AG-95 and a D435i, decisions on an RTX
 4090), right those of the pairs in `checkpoints/`, as committed, in the simulated task: as many seeds as the cells say,
 from {first["seeds"][0]} on, far from those of the demonstrations; teacher and control play the first of the student's.
-They play under three presets ([guide](../guides/realism.md)): the ideal camera (`clean`), the errors of a depth camera (`d435i`),
-and these in a randomised cell (`d435i+dr`), under which the demonstrations were collected. How the pairs were trained:
-[robust_pairs.md](robust_pairs.md).
+All play under three presets ([guide](../guides/realism.md)): the ideal camera (`clean`), the errors of a depth camera
+(`d435i`), and these in a randomised cell (`d435i+dr`), under which most demonstrations were collected. How the pairs
+were trained: [robust_pairs.md](robust_pairs.md).
 
 {table(data)}
 
