@@ -12,6 +12,7 @@ from __future__ import annotations
 
 import shlex
 import sys
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -115,7 +116,7 @@ def play(task: str, pair: list[Path], amount: Amount, out: Path, command: str) -
     results = evaluate(
         named, env_id, amount.episodes, amount.seed, out / task, realism=presets, videos=0, command=command
     )
-    shared = {key: results[key] for key in ("env_id", "machine", "versions")}
+    shared = {key: results[key] for key in ("env_id", "machine", "versions", "intervals")}
     rows = [_without_episodes(row) for row in results["realism"]["rows"]]
     if (more := amount.student_episodes - amount.episodes) > 0:
         first = amount.seed + amount.episodes
@@ -138,21 +139,25 @@ def _without_episodes(row: dict[str, Any]) -> dict[str, Any]:
 
 
 def _joined(row: dict[str, Any], more: dict[str, Any]) -> dict[str, Any]:
-    """Return the row of a policy that played more seeds under the same preset; both rows count their own."""
+    """Return the row of a policy that played more seeds under the same preset, all its rates over both."""
+    from manicm_ms.evaluation.results import renewed
+
     assert (row["preset"], row["role"]) == (more["preset"], more["role"])
-    n, successes = row["n"] + more["n"], row["successes"] + more["successes"]
-    low, high = rate_interval(successes, n)
-    return {
-        "preset": row["preset"],
-        "policy": row["policy"],
-        "role": row["role"],
-        "n": n,
-        "successes": successes,
-        "success_rate": successes / n,
-        "ci95": [low, high],
-        "crashed": row["crashed"] + more["crashed"],
-        "failed_seeds": [*row["failed_seeds"], *more["failed_seeds"]],
-    }
+    together = {**row, **_summed(row, more, ("n", "successes", "crashed"))}
+    for rate in ("success_once", "success_at_end"):
+        both = _summed(row[rate], more[rate], ("n", "successes"))
+        low, high = rate_interval(both["successes"], both["n"])
+        together[rate] = {**both, "success_rate": both["successes"] / both["n"], "ci95": [low, high]}
+    if row["against_reference"] is not None:
+        together["against_reference"] = _summed(
+            row["against_reference"], more["against_reference"], PairedCounts._fields
+        )
+    together["failed_seeds"] = [*row["failed_seeds"], *more["failed_seeds"]]
+    return renewed({"realism": {"rows": [together]}})["realism"]["rows"][0]
+
+
+def _summed(first: dict[str, Any], second: dict[str, Any], keys: Sequence[str]) -> dict[str, Any]:
+    return {key: first[key] + second[key] for key in keys}
 
 
 # ---- the page -------------------------------------------------------------------------------------------------------
