@@ -194,3 +194,17 @@ def test_the_vulkan_driver_is_chosen_before_sapien_is_imported(tmp_path):
     told = json.loads(done.stdout.splitlines()[-1])
     assert "manicm_ms.tasks.slide_block" in told  # or this test would look at nothing
     assert set(told.values()) == {str(tmp_path / "driver.json")}, told
+
+
+POLICY_ROOMS = ("encoders", "backbones", "heads")
+"""Rooms of policies/, each of which may import those before it; above them stand methods and checkpoints."""
+POLICY_BASE = {"configuration", "normalizer", "policy", "finite"}
+
+
+@pytest.mark.parametrize("room", POLICY_ROOMS)
+def test_a_room_of_the_policies_imports_no_room_above_it(room):
+    allowed = {*POLICY_ROOMS[: POLICY_ROOMS.index(room) + 1], *POLICY_BASE}
+    for name in MODULES:
+        if name.startswith(f"manicm_ms.policies.{room}"):
+            theirs = {other.split(".")[2] for other in imports(name) if other.startswith("manicm_ms.policies.")}
+            assert theirs <= allowed, name
