@@ -60,7 +60,7 @@ def method_folder(tmp_path_factory):
 def test_the_blocks_are_a_clean_file(method_folder):
     root = GUIDE.parents[2]
     done = subprocess.run(
-        [sys.executable, "-m", "ruff", "check", "--config", root / "pyproject.toml", "--ignore", "ANN,RUF012",
+        [sys.executable, "-m", "ruff", "check", "--config", root / "pyproject.toml", "--ignore", "ANN,RUF012,E302,E305",
          method_folder / "regression.py"],
         capture_output=True, text=True, check=False,
     )  # fmt: skip
