@@ -497,3 +497,9 @@ def test_a_row_of_another_form_is_refused_where_it_is_written(wrong):
     row = {"sentence": "", "reference": "", "encoder": "dp3", "head": "gmm", "objective": "plain", "nfe": 1}
     with pytest.raises(ConfigError, match="of a method is"):
         Method(**{**row, "chunk": ChunkSpec(1, 1, 1), **wrong})
+
+
+@pytest.mark.parametrize("method", METHODS.names())
+def test_a_row_says_how_often_its_network_is_evaluated(method):
+    row = METHODS.get(method)
+    assert make_policy(method, make_spec(), size="smoke", seed=0).nfe == row.nfe
