@@ -18,7 +18,7 @@ from manicm_ms.evaluation.latency import Latency, measure_latency
 from manicm_ms.evaluation.machine import machine
 from manicm_ms.machine.devices import resolve_device
 from manicm_ms.paths import write_text
-from manicm_ms.policies.methods import make_policy, student_of, with_nfe
+from manicm_ms.policies.methods import make_policy, student_of
 from manicm_ms.policies.policy import Policy
 from manicm_ms.spec import ActionSpec, ChunkSpec, EnvSpec, ObsSpec
 
@@ -49,7 +49,7 @@ def contestants(device: str) -> dict[str, Policy]:
         teacher = make_policy(registered, door_spec(), CHUNK, seed=0).to(device)
         policies[f"{name} teacher"] = teacher
         student = student_of(teacher)
-        policies |= {f"{name} student, {nfe}-step": with_nfe(student, nfe) for nfe in STUDENT_NFE}
+        policies |= {f"{name} student, {nfe}-step": student.with_nfe(nfe) for nfe in STUDENT_NFE}
     return policies
 
 

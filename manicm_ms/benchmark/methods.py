@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -11,7 +12,7 @@ from typing import TYPE_CHECKING, NamedTuple
 from rich.console import Console
 
 from manicm_ms.errors import ConfigError, UnknownNameError
-from manicm_ms.policies.methods import methods_of
+from manicm_ms.policies.methods import METHODS, STUDENT, head_with_nfe, methods_of
 from manicm_ms.training.presets import STUDENT_PRESETS, preset_for
 
 if TYPE_CHECKING:
@@ -136,16 +137,14 @@ class OneStep(Method):
 
 @dataclass(frozen=True)
 class Student(Method):
-    """A ManiCM student.
+    """A student of one network evaluation, distilled as ManiCM.
 
     Attributes:
         teacher: what it is distilled from.
-        nfe: its network evaluations.
     """
 
     name: str
     teacher: Trained
-    nfe: int
 
     @property
     def made_from(self) -> Method | None:
@@ -158,7 +157,7 @@ class Student(Method):
 
         assert source is not None
         distill(
-            source, training.data, out, replace(STUDENT_PRESETS.get(training.preset), nfe=self.nfe),
+            source, training.data, out, replace(STUDENT_PRESETS.get(training.preset), nfe=1),
             device=training.device, seed=training.seed, snapshots=training.snapshots, console=training.console,
             command=training.command,
         )  # fmt: skip
@@ -168,56 +167,112 @@ class Student(Method):
         return _load(checkpoint, device)
 
 
+@dataclass(frozen=True)
+class Steps(Method):
+    """Another method's checkpoint with its network evaluated another number of times a decision.
+
+    Attributes:
+        method: whose checkpoint it is.
+        nfe: network evaluations.
+    """
+
+    name: str
+    method: Trained | Student
+    nfe: int
+
+    @property
+    def made_from(self) -> Method | None:
+        """See `Method.made_from`."""
+        return self.method
+
+    @property
+    def folder(self) -> str:
+        """See `Method.folder`."""
+        return f"{self.name.partition(':')[0]}-{(self.method.made_from or self.method).name}"
+
+    @property
+    def trains(self) -> bool:
+        """See `Method.trains`."""
+        return False
+
+    def train(self, out: Path, source: Path | None, training: Training) -> None:
+        """Do nothing: the checkpoint is another method's."""
+
+    def load(self, checkpoint: Path, device: str) -> Policy:
+        """See `Method.load`."""
+        return _load(checkpoint, device).with_nfe(self.nfe)
+
+
 def _load(checkpoint: Path, device: str) -> ActionPolicy:
     from manicm_ms.policies.checkpoint import load_checkpoint
 
     return load_checkpoint(checkpoint, device=device)
 
 
-# name -> (teacher, name) -> method
-_MADE_FROM_TEACHER = {
-    "one_step": lambda teacher, name: OneStep(name, teacher),
-    "manicm": lambda teacher, name: Student(name, teacher, nfe=1),
-    "manicm_4": lambda teacher, name: Student(name, teacher, nfe=4),
-}
+ONE_STEP = "one_step"
 
 
 def method_names() -> tuple[str, ...]:
     """Return the names of all methods: what is trained on demonstrations, and what is made of a teacher."""
     from manicm_ms.training.objectives.objective import trained_methods
 
-    return (*trained_methods(), *_MADE_FROM_TEACHER)
+    return (*trained_methods(), ONE_STEP, *methods_of("student"))
 
 
 def parse_methods(names: Sequence[str]) -> tuple[Method, ...]:
     """Return the methods of these names, in their order.
 
-    "manicm" is distilled from the one teacher among the names, or from simple_dp3 where there is none; with several,
-    "manicm:dp3" says from which.
+    A student is distilled from the one teacher among the names that its row is made for; manicm else from any that is
+    named. With several, "manicm:dp3" says from which, and with none it is the first that its row names.
+    A number behind a name is that of network evaluations: "simple_dp3_4" plays with the checkpoint of simple_dp3.
 
     Raises:
         UnknownNameError: no such method or teacher.
-        ConfigError: none, one named twice, or a method whose teacher is not clear.
+        ConfigError: none, one named twice, one whose teacher is not clear, or one that cannot be evaluated so often.
     """
-    teachers = [name for name in names if name in methods_of("teacher")]
     if not names or len(set(names)) < len(names):
         raise ConfigError(f"name each method once, of {', '.join(method_names())}; got {', '.join(names) or 'none'}")
+    teachers = [name for name in names if name in methods_of("teacher")]
     return tuple(_method(name, teachers) for name in names)
 
 
+_WITH_STEPS = re.compile(r"(?P<kind>\w+)_(?P<nfe>[1-9]\d*)")
+
+
 def _method(name: str, teachers: Sequence[str]) -> Method:
-    kind, _, teacher = name.partition(":")
+    kind, colon, teacher = name.partition(":")
     known = method_names()
+    if kind not in known and (steps := _WITH_STEPS.fullmatch(kind)) and steps["kind"] in known:
+        return _with_steps(name, steps["kind"], colon + teacher, int(steps["nfe"]), teachers)
     if kind not in known:
         raise UnknownNameError("method", name, known)
-    if kind not in _MADE_FROM_TEACHER:
-        if teacher:
-            raise ConfigError(f"{kind} is trained on demonstrations, not made from {teacher}: use {kind!r}")
-        return Trained(kind)
-    if not teacher and len(teachers) > 1:
-        raise ConfigError(f"{kind} of which teacher? write {' or '.join(f'{kind}:{t}' for t in teachers)}")
-    chosen = teacher or (teachers[0] if teachers else DEFAULT_TEACHER)
+    if kind == ONE_STEP:
+        return OneStep(name, _teacher_of(kind, teacher, teachers))
+    if kind in methods_of("student"):
+        return Student(name, _teacher_of(kind, teacher, teachers))
+    if teacher:
+        raise ConfigError(f"{kind} is trained on demonstrations, not made from {teacher}: use {kind!r}")
+    return Trained(kind)
+
+
+def _with_steps(name: str, kind: str, teacher: str, nfe: int, teachers: Sequence[str]) -> Steps:
+    method = _method(f"{kind}{teacher}", teachers)
+    if isinstance(method, OneStep):
+        raise ConfigError(f"{kind} is evaluated once a decision: to evaluate a teacher {nfe} times write TEACHER_{nfe}")
+    assert isinstance(method, Trained | Student)
+    head_with_nfe(kind, nfe)
+    return Steps(name, method, nfe)
+
+
+def _teacher_of(kind: str, named: str, teachers: Sequence[str]) -> Trained:
+    """Return what a method is made from: the teacher that it names, or that follows from those named beside it."""
+    own = METHODS.get(kind).teachers if kind != ONE_STEP else ()
+    any_teacher = kind in (ONE_STEP, STUDENT)
+    likely = [teacher for teacher in teachers if teacher in own] or (list(teachers) if any_teacher else [])
+    if not named and len(likely) > 1:
+        raise ConfigError(f"{kind} of which teacher? write {' or '.join(f'{kind}:{t}' for t in likely)}")
+    chosen = named or (likely[0] if likely else own[0] if own else DEFAULT_TEACHER)
     possible = methods_of("teacher")
     if chosen not in possible:
         raise UnknownNameError("teacher", chosen, possible)
-    return _MADE_FROM_TEACHER[kind](Trained(chosen), name)
+    return Trained(chosen)

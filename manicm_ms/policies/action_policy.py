@@ -155,6 +155,13 @@ class ActionPolicy(Policy):
             called, self.spec, self.chunk, transforms, fitted, self.encoder, head, self.normalizer
         )  # fmt: skip
 
+    def with_nfe(self, nfe: int) -> ActionPolicy:
+        """Return a policy that shares this one's weights and evaluates its network `nfe` times a decision.
+
+        Raises ConfigError where its head cannot.
+        """
+        return self.with_head(self.head.with_nfe(nfe))
+
     def one_step(self) -> ActionPolicy | None:
         """Return the control of a distillation: this policy with its network evaluated once; None without one."""
         head = self.head.one_step()

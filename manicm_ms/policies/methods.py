@@ -26,7 +26,7 @@ from manicm_ms.registry import TASKS, Registry
 from manicm_ms.spec import ChunkSpec, EnvSpec
 
 STUDENT = "manicm"
-"""The method that a distillation makes."""
+"""The method that a distillation makes of a teacher that no row names."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -46,6 +46,7 @@ class Method:
         inputs: transform -> its fields, in order.
         optimizer: fields of a training that are the method's rather than a preset's, as `weight_decay`.
         nfe: network evaluations of one decision.
+        teachers: of a student: the methods that it is distilled from, the usual one first.
     """
 
     sentence: str
@@ -59,6 +60,7 @@ class Method:
     size_chunks: Mapping[str, ChunkSpec] = field(default_factory=dict)
     inputs: Mapping[str, Nested] = field(default_factory=dict)
     optimizer: Nested = field(default_factory=dict)
+    teachers: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:
         for key in PARTS:
@@ -172,7 +174,7 @@ METHODS.add(
 METHODS.add(
     STUDENT,
     Method(
-        sentence="ManiCM's student, distilled from either teacher: evaluated once a decision.",
+        sentence="ManiCM's student, distilled from DP3 or Simple DP3: evaluated once a decision.",
         reference="Gao, Lu et al. 2024, ManiCM, arXiv:2406.01586",
         encoder="dp3",
         backbone="unet1d",
@@ -182,6 +184,7 @@ METHODS.add(
         chunk=ChunkSpec(2, 4, 3),
         size_chunks=_PAPER,
         inputs=_CLOUD_INPUTS,
+        teachers=("simple_dp3", "dp3"),
     ),
 )
 METHODS.add(
@@ -214,6 +217,22 @@ METHODS.add(
     ),
 )
 METHODS.add(
+    "pocket_manicm",
+    Method(
+        sentence="Pocket DP3's student, distilled as ManiCM: the mixer evaluated once a decision.",
+        reference="this package; ManiCM, arXiv:2406.01586, on the mixer of arXiv:2601.22018",
+        encoder="dp3",
+        backbone="mixer",
+        head="consistency",
+        objective="consistency",
+        nfe=1,
+        chunk=ChunkSpec(2, 4, 3),
+        size_chunks=_PAPER,
+        inputs=_CLOUD_INPUTS,
+        teachers=("pocket_dp3",),
+    ),
+)
+METHODS.add(
     "bc_rnn_3d",
     Method(
         sentence="Behaviour cloning with an LSTM over the last 10 frames, one action a decision.",
@@ -227,6 +246,11 @@ METHODS.add(
         optimizer={"betas": (0.9, 0.999), "weight_decay": 0.0},
     ),
 )
+
+
+def student_name(teacher: str) -> str:
+    """Return the method that a distillation of this one makes."""
+    return next((name for name in METHODS.names() if teacher in METHODS.get(name).teachers), STUDENT)
 
 
 def methods_of(role: str) -> tuple[str, ...]:
@@ -278,7 +302,7 @@ def student_of(teacher: ActionPolicy, nfe: int = 1, **consistency: Any) -> Actio
     """Return a student that starts from a copy of the teacher's weights and normalizer.
 
     Args:
-        teacher: a trained policy, left untouched.
+        teacher: a trained policy, left untouched; the student's row is the one whose `teachers` name it.
         nfe: network evaluations of one decision.
         **consistency: further fields of `ConsistencyConfig`.
 
@@ -288,10 +312,21 @@ def student_of(teacher: ActionPolicy, nfe: int = 1, **consistency: Any) -> Actio
     head = teacher.head
     if not isinstance(head, DiffusionHead):
         raise ConfigError(f"{teacher.name} cannot be distilled: give one of {', '.join(methods_of('teacher'))}")
-    return copy.deepcopy(teacher.with_head(ConsistencyHead.from_teacher(head, nfe, **consistency), STUDENT))
+    made = ConsistencyHead.from_teacher(head, nfe, **consistency)
+    return copy.deepcopy(teacher.with_head(made, student_name(teacher.name)))
 
 
-def with_nfe(student: ActionPolicy, nfe: int) -> ActionPolicy:
-    """Return a policy that shares a student's weights and evaluates its network `nfe` times a decision."""
-    assert isinstance(student.head, ConsistencyHead)
-    return student.with_head(student.head.with_nfe(nfe))
+def head_with_nfe(method: str, nfe: int) -> Nested:
+    """Return the section `head` with which a method evaluates its network `nfe` times a decision.
+
+    Raises:
+        UnknownNameError: no such method.
+        ConfigError: it cannot.
+    """
+    row = METHODS.get(method)
+    field_ = HEADS.get(_described(row.head)[NAME]).nfe_field
+    if field_ is None and nfe != row.nfe:
+        raise ConfigError(f"{method} takes {row.nfe} network evaluations a decision and no other number, got {nfe}")
+    changes = {} if field_ is None else {field_: nfe}
+    row.configuration(changes={"head": changes})  # raises where the number is out of range
+    return changes

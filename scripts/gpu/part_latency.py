@@ -25,7 +25,7 @@ from manicm_ms.machine.devices import resolve_device
 from manicm_ms.policies.action_policy import ActionPolicy
 from manicm_ms.policies.backbones.unet1d import UNet1D
 from manicm_ms.policies.encoders.encoder import Features
-from manicm_ms.policies.methods import make_policy, student_of, with_nfe
+from manicm_ms.policies.methods import make_policy, student_of
 from manicm_ms.policies.policy import Policy, example_observations
 
 PART = "latency"
@@ -103,7 +103,7 @@ def policies(device: torch.device, smoke: bool) -> Policies:
         ):
             student = student_of(copied).eval()
             for nfe in NFES:
-                made[model, dtype, nfe] = copied if nfe == copied.nfe else with_nfe(student, nfe).eval()
+                made[model, dtype, nfe] = copied if nfe == copied.nfe else student.with_nfe(nfe).eval()
     return made
 
 

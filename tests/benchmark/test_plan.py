@@ -5,7 +5,7 @@ from pathlib import Path
 import pytest
 
 from manicm_ms.benchmark.jobs import all_jobs
-from manicm_ms.benchmark.methods import OneStep, Student, Trained, parse_methods
+from manicm_ms.benchmark.methods import OneStep, Steps, Student, Trained, parse_methods
 from manicm_ms.benchmark.plan import Plan, parse_envs, parse_seeds
 from manicm_ms.envs.simulator import ENVS
 from manicm_ms.errors import ConfigError, UnknownNameError
@@ -21,16 +21,39 @@ def plan(**changes):
 
 def test_students_and_controls_come_from_the_one_teacher_named_or_from_the_default():
     assert parse_methods(["dp3", "manicm", "one_step"]) == (
-        Trained("dp3"), Student("manicm", Trained("dp3"), 1), OneStep("one_step", Trained("dp3")),
+        Trained("dp3"), Student("manicm", Trained("dp3")), OneStep("one_step", Trained("dp3")),
     )  # fmt: skip
-    assert parse_methods(["manicm_4"]) == (Student("manicm_4", Trained("simple_dp3"), 4),)
+    assert parse_methods(["manicm"]) == (Student("manicm", Trained("simple_dp3")),)
     both = parse_methods(["dp3", "simple_dp3", "manicm:dp3", "manicm:simple_dp3"])
     assert [m.made_from.name for m in both if m.made_from] == ["dp3", "simple_dp3"]
+
+
+def test_a_student_is_made_from_the_teacher_of_its_row():
+    names = ["simple_dp3", "pocket_dp3", "manicm", "pocket_manicm"]
+    assert [m.made_from.name for m in parse_methods(names)[2:]] == ["simple_dp3", "pocket_dp3"]
+    assert parse_methods(["dp3", "pocket_manicm"])[1] == Student("pocket_manicm", Trained("pocket_dp3"))
+    assert parse_methods(["pocket_dp3", "manicm"])[1] == Student("manicm", Trained("pocket_dp3"))
+
+
+def test_a_number_behind_a_name_is_that_of_network_evaluations():
+    four, student, of_dp3 = parse_methods(["simple_dp3_4", "manicm_4", "manicm_2:dp3"])
+    assert four == Steps("simple_dp3_4", Trained("simple_dp3"), 4)
+    assert student == Steps("manicm_4", Student("manicm", Trained("simple_dp3")), 4)
+    assert of_dp3 == Steps("manicm_2:dp3", Student("manicm:dp3", Trained("dp3")), 2)
+    assert [m.folder for m in (four, student, of_dp3)] == [
+        "simple_dp3_4-simple_dp3", "manicm_4-simple_dp3", "manicm_2-dp3",
+    ]  # fmt: skip
+    assert [m.owner.name for m in (four, student, of_dp3)] == ["simple_dp3", "manicm", "manicm:dp3"]
 
 
 @pytest.mark.parametrize(
     ("names", "error", "text"),
     [
+        (["simple_dp3_101"], ConfigError, "num_inference_steps=101 must lie between 1"),
+        (["manicm_11"], ConfigError, "nfe=11 must lie between 1 and num_solver_steps=10"),
+        (["bc_gmm_3d_2"], ConfigError, "bc_gmm_3d takes 1 network evaluations a decision"),
+        (["one_step_4"], ConfigError, "write TEACHER_4"),
+        (["simple_dp3_0"], UnknownNameError, "unknown method 'simple_dp3_0'"),
         ([], ConfigError, "name each method once"),
         (["manicm", "manicm"], ConfigError, "name each method once"),
         (["dp3", "simple_dp3", "manicm"], ConfigError, "manicm:dp3 or manicm:simple_dp3"),

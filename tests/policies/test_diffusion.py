@@ -93,7 +93,7 @@ def test_sampling_is_ddim(prediction_type, steps):
     head, features = policy.head, policy.encode(make_obs(policy.spec, 5))
     noise = torch.randn(5, 4, 3, generator=torch.Generator().manual_seed(3))
     with torch.no_grad():
-        got, expected = head.with_steps(steps).sample(features, noise), ddim_by_hand(head, features, noise, steps)
+        got, expected = head.with_nfe(steps).sample(features, noise), ddim_by_hand(head, features, noise, steps)
     torch.testing.assert_close(got, expected, rtol=1e-4, atol=1e-4)
 
 
@@ -134,7 +134,7 @@ def test_nfe_is_the_number_of_network_calls():
     policy.act(make_obs(policy.spec, 1))
     assert policy.nfe == len(counted.times) == 10
     counted.times.clear()
-    four = policy.with_head(policy.head.with_steps(4))
+    four = policy.with_head(policy.head.with_nfe(4))
     four.act(make_obs(policy.spec, 1))
     assert four.nfe == 4
     assert counted.times == [[[75]], [[50]], [[25]], [[0]]]

@@ -4,7 +4,7 @@ from diffusers import LCMScheduler
 from policy_specs import CHUNK, TINY, make_obs, make_spec, wobble
 
 from manicm_ms.errors import ConfigError
-from manicm_ms.policies.methods import make_policy, methods_of, student_of, with_nfe
+from manicm_ms.policies.methods import make_policy, methods_of, student_of
 
 
 def student(nfe=1, prediction_type="sample", **consistency):
@@ -136,7 +136,7 @@ def test_a_start_noise_alone_is_completed_from_the_generator():
 
 def test_the_same_weights_act_with_another_number_of_evaluations():
     policy = student(1)
-    four = with_nfe(policy, 4)
+    four = policy.with_nfe(4)
     assert (policy.nfe, four.nfe) == (1, 4)
     assert four.encoder is policy.encoder
     assert four.normalizer is policy.normalizer
@@ -144,7 +144,7 @@ def test_the_same_weights_act_with_another_number_of_evaluations():
     obs, g = make_obs(policy.spec, 2), torch.Generator().manual_seed(0)
     assert not torch.equal(four.act(obs, generator=g), policy.act(obs, generator=g.manual_seed(0)))
     with pytest.raises(ConfigError, match="nfe=11"):
-        with_nfe(policy, 11)
+        policy.with_nfe(11)
 
 
 def test_is_rebuilt_from_its_configuration():

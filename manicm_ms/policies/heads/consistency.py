@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import copy
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, fields
 from typing import Any
 
 import numpy as np
@@ -75,6 +75,7 @@ class ConsistencyHead(ActionHead):
     Config = ConsistencyConfig
     needs_backbone = True
     role = "student"
+    nfe_field = "nfe"
     alphas_cumprod: Tensor
     config: ConsistencyConfig
     backbone: Backbone
@@ -101,10 +102,6 @@ class ConsistencyHead(ActionHead):
         process = {f.name: getattr(teacher.config, f.name) for f in fields(DiffusionConfig)}
         config = ConsistencyConfig(**process, nfe=nfe, **consistency)
         return cls(config, copy.deepcopy(teacher.backbone), *teacher.shape).to(teacher.alphas_cumprod.device)
-
-    def with_nfe(self, nfe: int) -> ConsistencyHead:
-        """Return a head that shares these weights and evaluates the network `nfe` times a decision."""
-        return type(self)(replace(self.config, nfe=nfe), self.backbone, *self.shape).to(self.alphas_cumprod.device)
 
     @property
     def nfe(self) -> int:

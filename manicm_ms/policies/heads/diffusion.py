@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
-from typing import Any, ClassVar, NamedTuple, Protocol, TypeVar
+from dataclasses import dataclass
+from typing import Any, ClassVar, NamedTuple, Protocol
 
 import torch
 from diffusers.schedulers.scheduling_ddim import DDIMScheduler
@@ -74,9 +74,6 @@ class Prediction(Protocol):
 
     def student_x0(self, x0: Tensor, limit: float) -> Tensor:
         """Return the clean action as a student's loss sees it; in sampling it is clipped to [-limit, limit]."""
-
-
-Head = TypeVar("Head", bound="DiffusionHead")
 
 
 PREDICTIONS: Registry[type[Prediction]] = Registry("prediction_type")
@@ -214,6 +211,7 @@ class DiffusionHead(TrainableHead):
     Config = DiffusionConfig
     needs_backbone = True
     role: ClassVar[str | None] = "teacher"
+    nfe_field: ClassVar[str | None] = "num_inference_steps"
     alphas_cumprod: Tensor
     config: DiffusionConfig
     backbone: Backbone
@@ -296,17 +294,9 @@ class DiffusionHead(TrainableHead):
         del state
         return self.sample(features, noise[0]), None
 
-    def with_steps(self, num_inference_steps: int) -> DiffusionHead:
-        """Return a head of the same weights that samples in another number of steps."""
-        return self._of_same_weights(type(self), replace(self.config, num_inference_steps=num_inference_steps))
-
     def one_step(self) -> OneStepHead:
         """Return the control of a distillation; see `OneStepHead`."""
-        return self._of_same_weights(OneStepHead, self.config)
-
-    def _of_same_weights(self, kind: type[Head], config: DiffusionConfig) -> Head:
-        """Return a head of a kind that is made as this one, on the same device, with the same backbone."""
-        return kind(config, self.backbone, *self.shape).to(self.alphas_cumprod.device)
+        return self._of_same_network(OneStepHead, self.config)
 
     def _sampler(self, steps: int) -> DDIMScheduler:
         if steps not in self._samplers:
@@ -321,6 +311,7 @@ class OneStepHead(DiffusionHead):
     """
 
     role = None
+    nfe_field = None
 
     @property
     def nfe(self) -> int:

@@ -4,11 +4,13 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Mapping
-from typing import Any, ClassVar
+from dataclasses import replace
+from typing import Any, ClassVar, TypeVar
 
 import torch
 from torch import Tensor, nn
 
+from manicm_ms.errors import ConfigError
 from manicm_ms.policies.backbones.backbone import Backbone
 from manicm_ms.policies.encoders.encoder import Features, FeatureShape
 from manicm_ms.registry import TASKS, Registry
@@ -16,6 +18,9 @@ from manicm_ms.spec import ChunkSpec
 
 State = dict[str, Tensor]
 """What a head remembers from one decision to the next: name -> (B, ...)."""
+
+
+H = TypeVar("H", bound="ActionHead")
 
 
 class ActionHead(nn.Module, ABC):
@@ -30,6 +35,7 @@ class ActionHead(nn.Module, ABC):
         times: numbers that it passes to its backbone with each chunk: 1 for a diffusion time.
         needs_backbone: whether it runs one.
         role: "teacher" for a head that can be distilled (a `DiffusionHead`), "student" for one that was, else None.
+        nfe_field: field of `Config` that is the number of network evaluations of a decision; None where it is fixed.
         reads: the features that it reads, where it has no backbone.
         config: the fields that it was made with.
         backbone: its network, or None.
@@ -41,6 +47,7 @@ class ActionHead(nn.Module, ABC):
     times: ClassVar[int] = 1
     needs_backbone: ClassVar[bool] = False
     role: ClassVar[str | None] = None
+    nfe_field: ClassVar[str | None] = None
     reads: tuple[str, ...] = ("cond",)
     config: Any
     backbone: Backbone | None
@@ -82,9 +89,24 @@ class ActionHead(nn.Module, ABC):
         del n
         return None
 
+    def with_nfe(self, nfe: int) -> ActionHead:
+        """Return a head that shares this one's network and evaluates it `nfe` times a decision.
+
+        Raises ConfigError where it cannot.
+        """
+        if self.nfe_field is None:
+            if nfe == self.nfe:
+                return self
+            raise ConfigError(f"a {type(self).__name__} takes nfe={self.nfe} in a decision and no other, got {nfe}")
+        return self._of_same_network(type(self), replace(self.config, **{self.nfe_field: nfe}))
+
     def one_step(self) -> ActionHead | None:
         """Return a head of the same weights that is evaluated once: the control of a distillation; None without one."""
         return None
+
+    def _of_same_network(self, kind: type[H], config: Any) -> H:
+        """Return a head of a kind that is made as this one, on the same device, with the same backbone."""
+        return kind(config, self.backbone, *self.shape).to(next(self.parameters()).device)
 
 
 class TrainableHead(ActionHead):
