@@ -114,6 +114,8 @@ class ActionPolicy(Policy):
 
     def fit_normalizer(self, stats: Mapping[str, ChannelStats]) -> None:
         """Set the normalizer from the ranges of what the policy reads and of `action`, each in its unit."""
+        for transform in self._transforms:
+            stats = transform.ranges(stats)
         self.normalizer.fit(stats, {AGENT_POS: self.normalizer_config.min_state_range})
 
     def encode(self, obs: Obs, noise: Tensor | None = None) -> Features:

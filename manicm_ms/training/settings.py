@@ -9,6 +9,7 @@ from typing import Any
 from manicm_ms.policies.action_policy import NormalizerConfig, read_parts
 from manicm_ms.policies.backbones.backbone import BACKBONES
 from manicm_ms.policies.configuration import NAME, Nested, lookup
+from manicm_ms.policies.encoders.crop import CropConfig
 from manicm_ms.policies.encoders.encoder import ENCODERS
 from manicm_ms.policies.encoders.transform import TRANSFORMS
 from manicm_ms.policies.heads.head import HEADS
@@ -60,6 +61,8 @@ def _defaults(config: Nested) -> dict[str, Any]:
 
 _ADDED_LATER = {"acting_points": "prefix", "training_points": "random", "min_state_range": 0.0}
 """Options that came after runs were made without them, with what those runs did."""
+_PARTS_ADDED_LATER = {"crop": CropConfig()}
+"""Transforms that rows came to name after runs were made without them, with fields that change nothing."""
 _FIRST_METHODS = ("dp3", "simple_dp3")
 """Methods that runs were made with before there was a table: their identity says how a run departs from the row."""
 _FORMER = {"ema_decay": "mu", "solver_stride": "skip"}
@@ -98,9 +101,9 @@ def _resolved(config: Nested) -> dict[str, Any]:
     """Return every field of every part, JSON values: it stays true whatever the row and the defaults become."""
     parts = read_parts({key: value for key, value in config.items() if key != CHUNK})
     named = {"encoder": parts.encoder, "backbone": parts.backbone, "head": parts.head, **parts.inputs}
-    return {key: None if part is None else [part[0].__qualname__, asdict(part[1])] for key, part in named.items()} | {
-        "normalizer": asdict(parts.normalizer)
-    }
+    told = {key: None if part is None else [part[0].__qualname__, asdict(part[1])] for key, part in named.items()}
+    idle = [key for key, fields in _PARTS_ADDED_LATER.items() if key in named and named[key][1] == fields]
+    return {key: value for key, value in told.items() if key not in idle} | {"normalizer": asdict(parts.normalizer)}
 
 
 def _lists(value: Any) -> Any:

@@ -9,6 +9,7 @@ from typing import Any, ClassVar
 import torch
 from torch import Tensor, nn
 
+from manicm_ms.policies.policy import ChannelStats
 from manicm_ms.registry import TASKS, Registry
 from manicm_ms.spec import EnvSpec
 
@@ -68,6 +69,10 @@ class InputTransform(nn.Module, ABC):
     def acts_on_noise(self) -> bool:
         """Whether `read_acting` reads the noise."""
         return False
+
+    def ranges(self, stats: Mapping[str, ChannelStats]) -> Mapping[str, ChannelStats]:
+        """Return the ranges of what is read, given those of the training data: what the normalizer is fitted from."""
+        return stats
 
     def normalized(self, normalized: dict[str, Tensor], raw: Obs) -> dict[str, Tensor]:
         """Return the normalised observations, where this transform has them otherwise than by their ranges.
