@@ -140,12 +140,13 @@ FREE_SPEED, LOWER_SPEED, PUSH_SPEED, RETREAT_SPEED = 0.22, 0.12, 0.10, 0.15  # m
 class SlideBlockExpert(WaypointExpert):
     """Goes behind the block, lowers the closed fingers and pushes it over the edge.
 
-    Style "one-sided" pushes towards base +y, the robot's own left; "two-sided" draws +y or -y for each episode from
-    its seed.
+    Style "one-sided" pushes towards base +y, the robot's own left, "other-sided" towards -y; "two-sided" draws either
+    for each episode from its seed. Stores of the first two over the same seeds together hold both ways from the very
+    same start states.
     """
 
     name = "slide-block way-points"
-    styles = ("one-sided", "two-sided")
+    styles = ("one-sided", "two-sided", "other-sided")
     motion = Motion(TCP_STEP, TCP_TURN, OPENING_MAX)
 
     def plan(self, scene: Mapping[str, Tensor], seeds: Sequence[int]) -> list[Waypoint]:
@@ -164,9 +165,12 @@ class SlideBlockExpert(WaypointExpert):
         ]
 
     def _sides(self, seeds: Sequence[int]) -> Tensor:
-        if self.style == "one-sided":
-            return torch.ones(len(seeds))
+        if (side := _SIDES.get(self.style)) is not None:
+            return torch.full((len(seeds),), side)
         return torch.tensor([_coin(seed) for seed in seeds])
+
+
+_SIDES = {"one-sided": 1.0, "other-sided": -1.0}
 
 
 def _coin(seed: int) -> float:

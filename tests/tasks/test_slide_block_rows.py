@@ -122,6 +122,7 @@ def side(expert_style, seeds):
 
 def test_styles_push_to_one_side_or_to_either():
     assert side("one-sided", range(60)).unique().tolist() == [1.0]
+    assert side("other-sided", range(60)).unique().tolist() == [-1.0]
     two = side("two-sided", range(60))
     assert set(two.unique().tolist()) == {-1.0, 1.0}
     assert abs(two.mean()) < 0.4  # fair: beyond 3 sigma of 60 coins
