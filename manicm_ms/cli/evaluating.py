@@ -34,7 +34,8 @@ def evaluate_command(
     """Evaluate policies on the same held-out seeds: success with intervals, paired difference, latency, report.
 
     Args:
-        checkpoints: checkpoint folders, the teacher first and the student last.
+        checkpoints: checkpoint folders, the teacher first and the student last; FOLDER@4 is one whose network is
+            evaluated 4 times a decision.
         env: environment id.
         policy: a policy of your own, FILE.py:FUNCTION; may be repeated, and stand beside checkpoints.
         out: folder of results.json, report.md and report.html.

@@ -6,11 +6,11 @@ from collections.abc import Collection, Sequence
 from dataclasses import replace
 from itertools import count
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, NamedTuple
 
 from manicm_ms.errors import ConfigError, SpecMismatchError
 from manicm_ms.evaluation.origins import Origin, require_unseen
-from manicm_ms.evaluation.protocol import CONTROL, OTHER, STUDENT, TEACHER, EvaluatedPolicy
+from manicm_ms.evaluation.protocol import CONTROL, OTHER, STUDENT, TEACHER, EvaluatedPolicy, slug
 from manicm_ms.paths import sha256
 from manicm_ms.spec import DP3_FRAME, EnvSpec, require_compatible
 
@@ -21,26 +21,61 @@ if TYPE_CHECKING:
 def load_policies(checkpoints: Sequence[Path], device: str = "cpu", control: bool = True) -> list[EvaluatedPolicy]:
     """Load the checkpoints, with the control row behind the first where it is a teacher and the row is asked for.
 
-    Names are the folders' names, with their parents' where two are alike.
+    Names are the folders' names, with their parents' where two are alike. FOLDER@N is the checkpoint FOLDER with its
+    network evaluated N times a decision.
+
+    Raises ConfigError where a network cannot be evaluated so often, CheckpointError where a checkpoint cannot be read.
     """
     from manicm_ms.policies.checkpoint import load_checkpoint, read_manifest
 
-    paths = [Path(p) for p in checkpoints]
-    names = [p.resolve().name for p in paths]
-    if len(set(names)) < len(names):
-        names = [f"{p.resolve().parent.name}/{p.resolve().name}" for p in paths]
-    if len(set(names)) < len(names):
-        raise ConfigError(f"two checkpoints have one name ({', '.join(names)}): name different ones")
+    asked = [_Asked.read(p) for p in checkpoints]
+    names = _names(asked)
+    loaded = [load_checkpoint(a.folder, device=device) for a in asked]
     policies = []
-    loaded = [load_checkpoint(path, device=device) for path in paths]
-    for name, path, policy in zip(names, paths, loaded, strict=True):
-        origin = Origin.read(policy.spec.env_id, read_manifest(path)["provenance"])
-        role, digest = role_of(policy), checkpoint_digest(str(path))
-        policies.append(EvaluatedPolicy(name, role, str(path), policy, origin, digest))
+    for name, place, whole in zip(names, asked, loaded, strict=True):
+        origin = Origin.read(whole.spec.env_id, read_manifest(place.folder)["provenance"])
+        policy = whole if place.nfe is None else whole.with_nfe(place.nfe)
+        role, digest = role_of(policy), checkpoint_digest(str(place.folder))
+        policies.append(EvaluatedPolicy(name, role, str(place), policy, origin, digest))
     if control and loaded and (once := loaded[0].one_step()) is not None:
         named = f"{policies[0].name}, one step"
         policies.insert(1, replace(policies[0], name=named, role=CONTROL, policy=once))
     return policies
+
+
+class _Asked(NamedTuple):
+    """A checkpoint as the caller names it: its folder, and network evaluations where they are not its own."""
+
+    folder: Path
+    nfe: int | None = None
+
+    @classmethod
+    def read(cls, path: Path) -> _Asked:
+        """Return what FOLDER or FOLDER@N names; a folder whose own name ends so is that folder."""
+        folder, at, number = str(path).rpartition("@")
+        if at and number.isdecimal() and not Path(path).exists():
+            return cls(Path(folder), int(number))
+        return cls(Path(path))
+
+    def __str__(self) -> str:
+        return str(self.folder) if self.nfe is None else f"{self.folder}@{self.nfe}"
+
+
+def _names(asked: Sequence[_Asked]) -> list[str]:
+    """Return a name for each checkpoint, no two alike."""
+    ends = ["" if a.nfe is None else f"@{a.nfe}" for a in asked]
+    names = [f"{a.folder.resolve().name}{end}" for a, end in zip(asked, ends, strict=True)]
+    if _alike(names):
+        longer = [f"{a.folder.resolve().parent.name}/{a.folder.resolve().name}" for a in asked]
+        names = [f"{name}{end}" for name, end in zip(longer, ends, strict=True)]
+    if _alike(names):
+        raise ConfigError(f"two checkpoints have one name ({', '.join(names)}): name different ones")
+    return names
+
+
+def _alike(names: Sequence[str]) -> bool:
+    """Return whether two names would share their files."""
+    return len({slug(name) for name in names}) < len(names)
 
 
 def with_users(policies: Sequence[EvaluatedPolicy], sources: Sequence[str], spec: EnvSpec) -> list[EvaluatedPolicy]:

@@ -74,6 +74,18 @@ def test_without_control_only_the_checkpoints_are_played_and_seen_seeds_may_be_m
     assert [p["success_at_end"]["n"] for p in results["policies"]] == [1, 1]
 
 
+def test_a_number_behind_a_folder_is_that_of_network_evaluations(pair):
+    few = load_policies([pair[0], Path(f"{pair[0]}@4"), Path(f"{pair[1]}@2")], control=False)
+    assert [(c.name, c.role, c.policy.nfe) for c in few] == [
+        ("teacher", "teacher", 10), ("teacher@4", "teacher", 4), ("student@2", "student", 2),
+    ]  # fmt: skip
+    assert few[0].digest == few[1].digest
+    with pytest.raises(ConfigError, match="num_inference_steps=101 must lie between"):
+        load_policies([Path(f"{pair[0]}@101")])
+    with pytest.raises(ConfigError, match="two checkpoints have one name"):
+        load_policies([Path(f"{pair[0]}@4")] * 2)
+
+
 def test_the_role_is_the_checkpoints_own(pair):
     assert [(c.name, c.role) for c in load_policies([pair[1]])] == [("student", "student")]
     roles = [(c.name, c.role) for c in load_policies(pair[::-1])]
