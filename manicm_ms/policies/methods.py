@@ -136,7 +136,7 @@ def _described(part: str | Nested | None) -> Any:
 METHODS: Registry[Method] = Registry("method", group="manicm_ms.methods", outside=TASKS)
 """name -> row."""
 
-_CLOUD_INPUTS: Mapping[str, Nested] = {"crop": {}, "points": {}, "cloud_frame": {}}
+_CLOUD_INPUTS: Mapping[str, Nested] = {"cloud_crop": {}, "points": {}, "cloud_frame": {}}
 _DP3 = "Ze et al. 2024, 3D Diffusion Policy, arXiv:2403.03954"
 _PAPER = {"paper": ChunkSpec(2, 4, 2)}  # ManiCM, section 4.1
 _SIMPLE_UNET = {NAME: "unet1d", "down_dims": (128, 256, 384), "resnets_per_stage": 1, "mid_blocks": 1}

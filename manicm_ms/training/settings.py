@@ -9,7 +9,7 @@ from typing import Any
 from manicm_ms.policies.action_policy import NormalizerConfig, read_parts
 from manicm_ms.policies.backbones.backbone import BACKBONES
 from manicm_ms.policies.configuration import NAME, Nested, lookup
-from manicm_ms.policies.encoders.crop import CropConfig
+from manicm_ms.policies.encoders.cloud_crop import CropConfig
 from manicm_ms.policies.encoders.encoder import ENCODERS
 from manicm_ms.policies.encoders.transform import TRANSFORMS
 from manicm_ms.policies.heads.head import HEADS
@@ -61,7 +61,7 @@ def _defaults(config: Nested) -> dict[str, Any]:
 
 _ADDED_LATER = {"acting_points": "prefix", "training_points": "random", "min_state_range": 0.0}
 """Options that came after runs were made without them, with what those runs did."""
-_PARTS_ADDED_LATER = {"crop": CropConfig()}
+_PARTS_ADDED_LATER = {"cloud_crop": CropConfig()}
 """Transforms that rows came to name after runs were made without them, with fields that change nothing."""
 _FIRST_METHODS = ("dp3", "simple_dp3")
 """Methods that runs were made with before there was a table: their identity says how a run departs from the row."""

@@ -40,7 +40,7 @@ class _Range(NamedTuple):
     max: np.ndarray
 
 
-@TRANSFORMS.register("crop")
+@TRANSFORMS.register("cloud_crop")
 class CloudCrop(InputTransform):
     """Reads only the points inside a box, so that what a choice of few points is spent on is what matters.
 

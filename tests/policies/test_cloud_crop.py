@@ -8,7 +8,7 @@ from policy_specs import CHUNK, TINY, make_obs, make_spec
 from manicm_ms.demos.stats import field_stats
 from manicm_ms.errors import ConfigError
 from manicm_ms.policies.checkpoint import load_checkpoint, save_checkpoint
-from manicm_ms.policies.encoders.crop import CloudCrop, CropConfig
+from manicm_ms.policies.encoders.cloud_crop import CloudCrop, CropConfig
 from manicm_ms.policies.methods import make_policy
 from manicm_ms.spec import ACTION, AGENT_POS, POINT_CLOUD
 
@@ -45,7 +45,7 @@ def test_without_a_limit_nothing_changes():
 
 
 def test_a_policy_does_not_see_what_lies_outside_and_says_so_in_its_checkpoint(tmp_path):
-    policy = make_policy("simple_dp3", SPEC, CHUNK, TINY | {"inputs": {"crop": BOX}}, seed=0)
+    policy = make_policy("simple_dp3", SPEC, CHUNK, TINY | {"inputs": {"cloud_crop": BOX}}, seed=0)
     rng = np.random.default_rng(0)
     fields = {POINT_CLOUD: cloud().numpy().reshape(-1, 32, 3)} | {
         key: rng.normal(size=(6, dim)).astype(np.float32)
@@ -64,7 +64,7 @@ def test_a_policy_does_not_see_what_lies_outside_and_says_so_in_its_checkpoint(t
     save_checkpoint(policy, tmp_path / "saved", {})
     back = load_checkpoint(tmp_path / "saved")
     assert torch.equal(back.act(obs, noise=noise), policy.act(obs, noise=noise))
-    assert back.config_dict()["inputs"]["crop"] == BOX
+    assert back.config_dict()["inputs"]["cloud_crop"] == BOX
 
 
 def test_an_empty_box_is_refused():
