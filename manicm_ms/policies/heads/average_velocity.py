@@ -138,24 +138,25 @@ class AverageVelocityHead(TrainableHead):
             features: of the observations.
         """
         z, _, r, t = path
-        precise = Features(*(None if part is None else part.to(z.dtype) for part in features))
+        precise = features.changed(lambda part: part.to(z.dtype))
 
         def u(z: Tensor, r: Tensor, t: Tensor) -> tuple[Tensor, dict[str, Tensor]]:
             return self.backbone.tapped(z, self.times_of(r, t), precise, self.taps)
 
         tangents = (direction, torch.zeros_like(r), torch.ones_like(t))
         with torch.autocast(z.device.type, enabled=False):
-            value, du_dt, stages = torch.func.jvp(u, (z, r, t), tangents, has_aux=True)
+            value, du_dt, stages = torch.func.jvp(u, (z, r, t), tangents, has_aux=True)  # type: ignore[misc]
         return Derivative(value, du_dt.detach(), stages)
 
     def drawn_path(self, action: Tensor, generator: torch.Generator) -> Path:
         """Return random points between random noise and actions (B, Tp, Da), one a row; chance from `generator`."""
-        rows, like = len(action), {"device": action.device, "dtype": action.dtype}
-        e = torch.randn(action.shape, generator=generator, **like)
-        drawn = torch.randn(2, rows, generator=generator, **like)
+        rows, device, dtype = len(action), action.device, action.dtype
+        e = torch.randn(action.shape, generator=generator, device=device, dtype=dtype)
+        drawn = torch.randn(2, rows, generator=generator, device=device, dtype=dtype)
         two = torch.sigmoid(self.config.time_mean + self.config.time_std * drawn)  # (2, B)
         r, t = two.amin(0), two.amax(0)
-        r = torch.where(torch.rand(rows, generator=generator, **like) < self.config.equal_share, t, r)
+        chance = torch.rand(rows, generator=generator, device=device, dtype=dtype)
+        r = torch.where(chance < self.config.equal_share, t, r)
         return Path(torch.lerp(action, e, over_chunks(t)), e - action, r, t)
 
     def weighted(self, error: Tensor) -> Tensor:

@@ -76,7 +76,7 @@ class DriftHead(TrainableHead):
         noise = torch.randn(
             (rows * count, *action.shape[1:]), generator=generator, device=action.device, dtype=action.dtype
         )
-        repeated = Features(*(None if part is None else part.repeat_interleave(count, 0) for part in features))
+        repeated = features.changed(lambda part: part.repeat_interleave(count, dim=0))
         made = self.generate(repeated, noise).reshape(rows, count, -1)  # (B, G, Tp Da)
         now = made.detach()
         field, unit = drift_field(now, now, action.flatten(1)[:, None], self.config.temperatures)

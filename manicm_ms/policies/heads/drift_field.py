@@ -9,6 +9,7 @@ import torch
 from torch import Tensor
 
 LEAST_SCALE = 1e-3  # of the mean distance, in normalised actions
+LEAST_AFFINITY = 1e-6  # of a product of two soft-maxima: data beyond the reach of every temperature still attract
 LEAST_RMS = 1e-6  # of a force: where all points lie on the data it is 0 and stays 0
 BEYOND_REACH = 100.0  # mean distances, hundreds of temperatures
 
@@ -37,7 +38,7 @@ def drift_field(
     For each observation: let the targets be its samples and its data, d the distances from points to targets over
     their mean s, and for a temperature T
 
-        A_iy = sqrt(softmax_y(-d_iy / T) softmax_i(-d_iy / T)),   N = A of the samples, P = A of the data,
+        A_iy = sqrt(max(softmax_y(-d_iy / T) softmax_i(-d_iy / T), 1e-6)),   N = A of the samples, P = A of the data,
         force_i = sum_y P_iy (sum_j N_ij) (y - x_i) - sum_j N_ij (sum_y P_iy) (a_j - x_i)
 
     in units of s / sqrt(N). Each temperature's force is divided by its root mean square, and they add up. The mean
@@ -79,7 +80,7 @@ def _force(logits: Tensor, towards: Tensor, samples: int) -> Tensor:
         towards: (B, Q, G + P, N), target less point.
         samples: G, the targets that come first.
     """
-    affinity = (logits.softmax(2) * logits.softmax(1)).sqrt()
+    affinity = (logits.softmax(2) * logits.softmax(1)).clamp_min(LEAST_AFFINITY).sqrt()
     repelling, attracting = affinity[:, :, :samples], affinity[:, :, samples:]
     weights = torch.cat(
         [-repelling * attracting.sum(2, keepdim=True), attracting * repelling.sum(2, keepdim=True)], dim=2
