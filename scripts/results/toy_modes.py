@@ -44,7 +44,7 @@ SPEC = EnvSpec(
     max_episode_steps=1,
     agent_pos_names=("situation",),
 )
-BATCH = 256
+BATCH = 128
 HEADS: Mapping[str, Nested] = {
     "diffusion": {NAME: "diffusion"},
     "meanflow": {NAME: "meanflow"},
@@ -52,7 +52,6 @@ HEADS: Mapping[str, Nested] = {
     "meanflow, improved": {NAME: "meanflow", "velocity_target": "improved"},
     "uca_flow": {NAME: "uca_flow"},
     "drift": {NAME: "drift"},
-    "drift, 16 samples": {NAME: "drift", "samples": 16},
     "bc_gmm": {NAME: "gmm", "widths": (128, 128)},
 }
 
@@ -200,7 +199,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--out", type=Path, default=Path("docs/results/toy_modes.md"))
     parser.add_argument("--seeds", type=int, nargs="+", default=[0, 1])
-    parser.add_argument("--steps", type=int, default=4000)
+    parser.add_argument("--steps", type=int, default=2000)
     args = parser.parse_args()
     torch.set_num_threads(1)
     begin, seeds = time.monotonic(), tuple(args.seeds)
