@@ -159,6 +159,29 @@ def test_any_number_of_steps_follows_a_constant_velocity_to_its_action():
         torch.testing.assert_close(head.sample(Features(x[:, 0]), noise), x)
 
 
+@pytest.mark.parametrize("backbone", BACKBONES)
+@pytest.mark.parametrize(
+    ("method", "fields"),
+    [
+        ("meanflow", {"velocity_target": "improved"}),
+        ("meanflow", {"velocity_target": "extrapolated"}),
+        ("uca_flow", {}),
+    ],
+)
+def test_products_in_16_bits_leave_every_weight_its_gradient(method, fields, backbone):
+    head = head_of(method, backbone, **fields).float()
+    features, action = example(head)
+    features, action = features.changed(torch.Tensor.float), action.float()
+    slopes = []
+    for enabled in (False, True):
+        with torch.autocast("cpu", torch.bfloat16, enabled=enabled):
+            loss = head.loss(features, action, generator())
+        slopes.append(torch.autograd.grad(loss, list(head.parameters())))
+    assert all(slope.abs().sum() > 0 for slope in slopes[1])
+    exact, rounded = (torch.cat([slope.flatten() for slope in each]) for each in slopes)
+    assert torch.cosine_similarity(exact, rounded, dim=0) > 0.99
+
+
 # ---- the dispersive loss --------------------------------------------------------------------------------------------
 
 

@@ -17,9 +17,8 @@ from torch import Tensor
 
 from manicm_ms.errors import ConfigError, require_at_least
 from manicm_ms.policies.backbones.backbone import Backbone
-from manicm_ms.policies.encoders.encoder import Features, FeatureShape
+from manicm_ms.policies.encoders.encoder import Features
 from manicm_ms.policies.heads.head import State, TrainableHead
-from manicm_ms.spec import ChunkSpec
 
 
 @dataclass(frozen=True)
@@ -103,16 +102,6 @@ class AverageVelocityHead(TrainableHead):
     backbone: Backbone
     taps: tuple[str, ...] = ()
 
-    def __init__(
-        self,
-        config: AverageVelocityConfig,
-        backbone: Backbone,
-        chunk: ChunkSpec,
-        action_dim: int,
-        features: FeatureShape,
-    ) -> None:
-        super().__init__(config, backbone, chunk, action_dim, features)
-
     @abstractmethod
     def times_of(self, r: Tensor, t: Tensor) -> tuple[Tensor, Tensor]:
         """Return the two times (B,) that the backbone is told of the interval from r to t, (B,) each."""
@@ -170,7 +159,7 @@ class AverageVelocityHead(TrainableHead):
 
     def sample(self, features: Features, noise: Tensor) -> Tensor:
         """Return normalised chunks (B, Tp, Da): with one step x = e - u(e, 0, 1) for noise e (B, Tp, Da)."""
-        z, grid = noise, torch.linspace(1, 0, self.nfe + 1).tolist()
+        z, grid = noise, [1 - step / self.nfe for step in range(self.nfe + 1)]
         for end, start in pairwise(grid):
             r, t = (noise.new_full((len(noise),), time) for time in (start, end))
             z = z - (end - start) * self.velocity(z, r, t, features)

@@ -10,10 +10,9 @@ from torch.nn.functional import mse_loss
 
 from manicm_ms.errors import ConfigError, require_at_least
 from manicm_ms.policies.backbones.backbone import Backbone
-from manicm_ms.policies.encoders.encoder import Features, FeatureShape
+from manicm_ms.policies.encoders.encoder import Features
 from manicm_ms.policies.heads.drift_field import drift_field
 from manicm_ms.policies.heads.head import HEADS, State, TrainableHead
-from manicm_ms.spec import ChunkSpec
 
 
 @dataclass(frozen=True)
@@ -51,11 +50,6 @@ class DriftHead(TrainableHead):
     times = 0
     config: DriftConfig
     backbone: Backbone
-
-    def __init__(
-        self, config: DriftConfig, backbone: Backbone, chunk: ChunkSpec, action_dim: int, features: FeatureShape
-    ) -> None:
-        super().__init__(config, backbone, chunk, action_dim, features)
 
     @property
     def nfe(self) -> int:
