@@ -246,6 +246,51 @@ METHODS.add(
         optimizer={"betas": (0.9, 0.999), "weight_decay": 0.0},
     ),
 )
+METHODS.add(
+    "meanflow",
+    Method(
+        sentence="MeanFlow: one evaluation a decision, learnt from demonstrations without a teacher.",
+        reference="Geng et al. 2025, arXiv:2505.13447; MP1, arXiv:2507.10543",
+        encoder="dp3",
+        backbone=_SIMPLE_UNET,
+        head="meanflow",
+        objective="averaged",
+        nfe=1,
+        chunk=ChunkSpec(2, 4, 3),
+        size_chunks=_PAPER,
+        inputs=_CLOUD_INPUTS,
+    ),
+)
+METHODS.add(
+    "drift",
+    Method(
+        sentence="Drifting: samples move to demonstrations and away from one another; one evaluation, no teacher.",
+        reference="Deng et al. 2026, arXiv:2602.04770; DBP, arXiv:2604.03540",
+        encoder="dp3",
+        backbone=_SIMPLE_UNET,
+        head="drift",
+        objective="averaged",
+        nfe=1,
+        chunk=ChunkSpec(2, 4, 3),
+        size_chunks=_PAPER,
+        inputs=_CLOUD_INPUTS,
+    ),
+)
+METHODS.add(
+    "uca_flow",
+    Method(
+        sentence="UCA-Flow: average velocity on joint tokens of frames and actions; one evaluation, no teacher.",
+        reference="arXiv:2608.16153",
+        encoder="dp3",
+        backbone="tokens",
+        head="uca_flow",
+        objective="averaged",
+        nfe=1,
+        chunk=ChunkSpec(2, 4, 3),
+        size_chunks=_PAPER,
+        inputs=_CLOUD_INPUTS,
+    ),
+)
 
 
 def student_name(teacher: str) -> str:

@@ -43,6 +43,7 @@ def test_a_number_behind_a_name_is_that_of_network_evaluations():
     assert [m.folder for m in (four, student, of_dp3)] == [
         "simple_dp3_4-simple_dp3", "manicm_4-simple_dp3", "manicm_2-dp3",
     ]  # fmt: skip
+    assert parse_methods(["meanflow_4"]) == (Steps("meanflow_4", Trained("meanflow"), 4),)
     assert [m.owner.name for m in (four, student, of_dp3)] == ["simple_dp3", "manicm", "manicm:dp3"]
 
 

@@ -8,6 +8,7 @@ from typing import Any, ClassVar
 
 from torch import Tensor, nn
 
+from manicm_ms.errors import ConfigError
 from manicm_ms.policies.encoders.encoder import Features, FeatureShape
 from manicm_ms.registry import TASKS, Registry
 from manicm_ms.spec import ChunkSpec
@@ -23,12 +24,14 @@ class Backbone(nn.Module, ABC):
         Config: dataclass of its fields.
         sizes: name of a size ("smoke", "quick", "paper") -> fields that differ from the published ones.
         reads: the features that it reads, names of fields of `Features`.
+        stages: names of the stages whose outputs `tapped` can give, in order; none where there are none to speak of.
         config: the fields that it was made with.
     """
 
     Config: ClassVar[type[Any]]
     sizes: ClassVar[Mapping[str, Mapping[str, Any]]] = {}
     reads: ClassVar[tuple[str, ...]] = ("cond",)
+    stages: tuple[str, ...] = ()
     config: Any
 
     def __init__(self, config: Any, chunk: ChunkSpec, action_dim: int, features: FeatureShape, times: int = 1) -> None:
@@ -39,6 +42,17 @@ class Backbone(nn.Module, ABC):
     @abstractmethod
     def forward(self, x: Tensor, times: tuple[Tensor, ...], features: Features) -> Tensor:
         """Return (B, Tp, Da) for a chunk x (B, Tp, Da), times, each (B,), and the features of B rows."""
+
+    def tapped(
+        self, x: Tensor, times: tuple[Tensor, ...], features: Features, taps: tuple[str, ...]
+    ) -> tuple[Tensor, dict[str, Tensor]]:
+        """Return what `forward` does, and the outputs (B, ...) of the stages that `taps` names, for a loss on them.
+
+        Raises ConfigError where the backbone has no such stage.
+        """
+        if taps:
+            raise ConfigError(f"{type(self).__name__} has no stages that can be read, asked for {', '.join(taps)}")
+        return self(x, times, features), {}
 
 
 BACKBONES: Registry[type[Backbone]] = Registry(

@@ -33,7 +33,7 @@ class SinusoidalEmbedding(nn.Module):
 
     def forward(self, t: Tensor) -> Tensor:
         """Return (B, dim) for times (B,)."""
-        angles = t.float()[:, None] * self.rates
+        angles = t.to(torch.promote_types(self.rates.dtype, torch.float32))[:, None] * self.rates
         return torch.cat([angles.sin(), angles.cos()], dim=-1)
 
 
@@ -148,6 +148,9 @@ class UNet1D(Backbone):
         action_dim: Da.
         features: sizes of the observation's features.
         times: number of times that condition it.
+
+    Attributes:
+        stages: "down0", "down1", ...: each stage on the way down, before its length is halved.
     """
 
     Config = UNet1DConfig
@@ -169,6 +172,7 @@ class UNet1D(Backbone):
         upward = pairs[:0:-1]  # from the last stage to the second
         self.up = nn.ModuleList([FiLMStack(each, 2 * o, i, *shape) for i, o in upward])
         self.upsample = nn.ModuleList([nn.ConvTranspose1d(i, i, 4, stride=2, padding=1) for i, _ in upward])
+        self.stages = tuple(f"down{index}" for index in range(len(self.down)))
         self.head = nn.Sequential(
             ConvBlock(down_dims[0], down_dims[0], config.kernel_size, config.n_groups),
             nn.Conv1d(down_dims[0], action_dim, 1),
@@ -176,6 +180,14 @@ class UNet1D(Backbone):
 
     def forward(self, x: Tensor, times: tuple[Tensor, ...], features: Features) -> Tensor:
         """Return the prediction (B, Tp, Da) for noisy actions x (B, Tp, Da), times, each (B,), and features."""
+        return self.tapped(x, times, features, ())[0]
+
+    def tapped(
+        self, x: Tensor, times: tuple[Tensor, ...], features: Features, taps: tuple[str, ...]
+    ) -> tuple[Tensor, dict[str, Tensor]]:
+        """Return the prediction and the outputs (B, C, T) of the stages in `taps`; see `Backbone.tapped`."""
+        if unknown := [name for name in taps if name not in self.stages]:
+            raise ConfigError(f"the U-Net has the stages {', '.join(self.stages)}, asked for {', '.join(unknown)}")
         embedded = [embed(t) for embed, t in zip(self.time_embeddings, times, strict=True)]
         cond = torch.cat([sum(embedded[1:], embedded[0]), features.cond], dim=-1) if embedded else features.cond
         x = x.transpose(1, 2)  # (B, Da, Tp)
@@ -185,10 +197,11 @@ class UNet1D(Backbone):
             skips.append(x)
             if index < len(self.downsample):
                 x = self.downsample[index](x)
+        outputs = {name: skip for name, skip in zip(self.stages, skips, strict=True) if name in taps}
         x = self.middle(x, cond)
         for stage, upsample in zip(self.up, self.upsample, strict=True):
             x = upsample(stage(torch.cat([x, skips.pop()], dim=1), cond))
-        return self.head(x).transpose(1, 2)
+        return self.head(x).transpose(1, 2), outputs
 
 
 def _time_embedding(dim: int) -> nn.Sequential:

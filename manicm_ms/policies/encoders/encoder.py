@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import Any, ClassVar, NamedTuple
 
@@ -23,6 +23,10 @@ class Features(NamedTuple):
 
     cond: Tensor
     tokens: Tensor | None = None
+
+    def changed(self, change: Callable[[Tensor], Tensor]) -> Features:
+        """Return the features with `change` applied to each part that there is."""
+        return Features(change(self.cond), None if self.tokens is None else change(self.tokens))
 
 
 @dataclass(frozen=True)

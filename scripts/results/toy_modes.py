@@ -1,0 +1,230 @@
+#!/usr/bin/env python3
+"""Train every one-step family on two equally good actions, and measure which of them keep both.
+
+The actions are those of toy_distillation.py: two-dimensional, the same situation, two modes. Heads and objectives are
+the package's own, on a small MLP; each is trained for the same number of steps. Writes a Markdown page; about ten
+minutes on one free core.
+"""
+
+from __future__ import annotations
+
+import argparse
+import itertools
+import sys
+import time
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import torch
+from torch import Tensor, nn
+
+from manicm_ms.policies.action_policy import ActionPolicy, build_policy
+from manicm_ms.policies.backbones.backbone import BACKBONES, Backbone
+from manicm_ms.policies.backbones.unet1d import SinusoidalEmbedding
+from manicm_ms.policies.configuration import NAME, Nested
+from manicm_ms.policies.encoders.encoder import ENCODERS, Features, FeatureShape, ObsEncoder
+from manicm_ms.policies.methods import student_of
+from manicm_ms.spec import ACTION, AGENT_POS, ActionSpec, ChunkSpec, EnvSpec, ObsSpec
+from manicm_ms.training.features import CLEAN_ACTION
+from manicm_ms.training.objectives.consistency import ConsistencyDistillation
+from manicm_ms.training.objectives.head_loss import AveragedHeadObjective
+from manicm_ms.training.objectives.objective import PolicyObjective
+from manicm_ms.training.optim import FitConfig, PowerDecay, build_optimizer, build_scheduler
+
+sys.path.insert(0, str(Path(__file__).parent))
+from toy_distillation import EVAL_SAMPLES, MU, ModeScore, score_modes, two_modes
+
+CHUNK = ChunkSpec(n_obs_steps=1, horizon=1, n_action_steps=1)
+SPEC = EnvSpec(
+    env_id="toy/two-modes",
+    obs=ObsSpec(num_points=1, point_channels=3, agent_pos_dim=1, frame="robot_base"),
+    action=ActionSpec(("x", "y"), "position", 1.0),
+    max_episode_steps=1,
+    agent_pos_names=("situation",),
+)
+BATCH = 128
+HEADS: Mapping[str, Nested] = {
+    "diffusion": {NAME: "diffusion"},
+    "meanflow": {NAME: "meanflow"},
+    "meanflow, extrapolated (MP1)": {NAME: "meanflow", "velocity_target": "extrapolated"},
+    "meanflow, improved": {NAME: "meanflow", "velocity_target": "improved"},
+    "uca_flow": {NAME: "uca_flow"},
+    "drift": {NAME: "drift"},
+    "bc_gmm": {NAME: "gmm", "widths": (128, 128)},
+}
+
+
+@dataclass(frozen=True)
+class Width:
+    """Width of a part.
+
+    Attributes:
+        width: of its layers.
+    """
+
+    width: int = 128
+
+
+@ENCODERS.register("toy_situation")
+class Situation(ObsEncoder):
+    """The situation as it is."""
+
+    Config = Width
+    keys = (AGENT_POS,)
+
+    def __init__(self, config: Width, spec: EnvSpec, chunk: ChunkSpec) -> None:
+        super().__init__(config, spec, chunk)
+        self.shape = FeatureShape(chunk.n_obs_steps * spec.obs.agent_pos_dim)
+
+    def forward(self, obs: Mapping[str, Tensor]) -> Features:
+        """Return the situations (B, To D)."""
+        return Features(obs[AGENT_POS].flatten(1))
+
+
+@BACKBONES.register("toy_mlp")
+class MLP(Backbone):
+    """Three hidden layers over the chunk, the embedded times and the features."""
+
+    Config = Width
+
+    def __init__(
+        self, config: Width, chunk: ChunkSpec, action_dim: int, features: FeatureShape, times: int = 1
+    ) -> None:
+        super().__init__(config, chunk, action_dim, features, times)
+        outputs, width, embedded = chunk.horizon * action_dim, config.width, 32
+        self.embedding = SinusoidalEmbedding(embedded)
+        layers: list[nn.Module] = []
+        for fan_in, fan_out in itertools.pairwise((outputs + times * embedded + features.cond, *[width] * 3)):
+            layers += [nn.Linear(fan_in, fan_out), nn.Mish()]
+        self.mlp = nn.Sequential(*layers, nn.Linear(width, outputs))
+
+    def forward(self, x: Tensor, times: tuple[Tensor, ...], features: Features) -> Tensor:
+        """Return a chunk (B, Tp, Da); see `Backbone.forward`."""
+        inputs = [x.flatten(1), *(self.embedding(t) for t in times), features.cond]
+        return self.mlp(torch.cat(inputs, dim=-1)).reshape(x.shape)
+
+
+Batch = Callable[[torch.Generator], dict[str, Tensor]]
+
+
+def demonstrations(generator: torch.Generator) -> dict[str, Tensor]:
+    """Return a batch of raw windows: situations (B, 1, 1) and actions (B, 1, 2)."""
+    situations, actions = two_modes(BATCH, generator)
+    return {AGENT_POS: situations[:, None], ACTION: actions[:, None]}
+
+
+def features(generator: torch.Generator) -> dict[str, Tensor]:
+    """Return a batch as a distillation reads it: one draw of each situation's features, and actions (B, 1, 2)."""
+    situations, actions = two_modes(BATCH, generator)
+    return {"cond": situations[:, None], CLEAN_ACTION: actions[:, None]}
+
+
+def policy_of(head: Nested, seed: int) -> ActionPolicy:
+    """Return an untrained policy with this head; actions are not normalised further."""
+    config: dict[str, Any] = {"encoder": {NAME: "toy_situation"}, "head": head}
+    if head[NAME] != "gmm":
+        config["backbone"] = {NAME: "toy_mlp"}
+    with torch.random.fork_rng(devices=[]):
+        torch.manual_seed(seed)
+        return build_policy(str(head[NAME]), config, SPEC, CHUNK)
+
+
+def fitted(objective: PolicyObjective, batch: Batch, steps: int, learning_rate: float, seed: int) -> ActionPolicy:
+    """Return what an objective makes of so many steps; the same seed gives the same policy."""
+    config = FitConfig(steps=steps, batch_size=BATCH, learning_rate=learning_rate, warmup_steps=min(100, steps - 1))
+    optimizer = build_optimizer([p for p in objective.parameters() if p.requires_grad], config)
+    schedule = build_scheduler(optimizer, config, steps)
+    generator = torch.Generator().manual_seed(seed)
+    objective.train()
+    for _ in range(steps):
+        optimizer.zero_grad()
+        objective(batch(generator), generator).backward()
+        optimizer.step()
+        schedule.step()
+        objective.after_step()
+    return objective.outcome.eval()
+
+
+def samples_of(policy: ActionPolicy, seed: int) -> Tensor:
+    """Return actions (n, 2) in the one situation that there is, from noise that every policy gets."""
+    generator = torch.Generator().manual_seed(1000 + seed)
+    noise = torch.randn(2, EVAL_SAMPLES, 1, 2, generator=generator)[: policy.noise_draws]
+    return policy.act({AGENT_POS: torch.zeros(EVAL_SAMPLES, 1, 1)}, noise=noise)[:, 0]
+
+
+def policies_of(name: str, steps: int, seed: int) -> dict[str, ActionPolicy]:
+    """Return the rows of the table that come of one training: label -> policy."""
+    decay = PowerDecay()
+    policy = fitted(AveragedHeadObjective(policy_of(HEADS[name], seed), decay), demonstrations, steps, 1e-3, seed)
+    if name != "diffusion":
+        return {name: policy}
+    student = student_of(policy).requires_grad_(True)  # an average asks for no gradient
+    objective = ConsistencyDistillation(policy, student, ema_decay=MU)
+    distilled = fitted(objective, features, steps, 5e-4, seed)
+    once = policy.one_step()
+    assert once is not None
+    return {"diffusion, 10 steps": policy, "diffusion, its network once": once, "manicm (student of it)": distilled}
+
+
+def measured(steps: int, seeds: tuple[int, ...]) -> dict[str, list[tuple[int, ModeScore]]]:
+    """Return label -> network evaluations and score of each seed; says what is done on standard error."""
+    rows: dict[str, list[tuple[int, ModeScore]]] = {}
+    for seed, name in itertools.product(seeds, HEADS):
+        begin = time.monotonic()
+        for label, policy in policies_of(name, steps, seed).items():
+            score = score_modes(samples_of(policy, seed), torch.Generator().manual_seed(2000 + seed))
+            rows.setdefault(label, []).append((policy.nfe, score))
+            print(f"seed {seed}, {label}: {_cells(score)}", file=sys.stderr, flush=True)
+        print(f"  {steps} steps: {time.monotonic() - begin:.0f} s", file=sys.stderr, flush=True)
+    return rows
+
+
+def _cells(score: ModeScore) -> str:
+    return f"{score.on_mode:.3f} / {score.smaller_mode:.3f} / {score.energy:.4f}"
+
+
+def table(rows: Mapping[str, list[tuple[int, ModeScore]]], seeds: tuple[int, ...]) -> str:
+    """Return the Markdown table."""
+    head = f"| | evaluations | {' | '.join(f'seed {s}' for s in seeds)} |"
+    lines = [head, "|---" * (len(seeds) + 2) + "|"]
+    for label, scores in rows.items():
+        lines.append(f"| {label} | {scores[0][0]} | {' | '.join(_cells(score) for _, score in scores)} |")
+    return "\n".join(lines)
+
+
+def main() -> None:
+    """Write the page to the file named on the command line."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--out", type=Path, default=Path("docs/results/toy_modes.md"))
+    parser.add_argument("--seeds", type=int, nargs="+", default=[0, 1])
+    parser.add_argument("--steps", type=int, default=2000)
+    args = parser.parse_args()
+    torch.set_num_threads(1)
+    begin, seeds = time.monotonic(), tuple(args.seeds)
+    text = PAGE.format(
+        table=table(measured(args.steps, seeds), seeds),
+        steps=args.steps,
+        batch=BATCH,
+        samples=EVAL_SAMPLES,
+        seconds=time.monotonic() - begin,
+        torch=torch.__version__,
+    )
+    args.out.parent.mkdir(parents=True, exist_ok=True)
+    args.out.write_text(text)
+    print(text)
+
+
+PAGE = """# Which one-step methods keep two modes: two-dimensional actions
+
+{table}
+
+Share of samples on a mode / share on the rarer mode (0.5 at best) / energy distance to fresh data (0 at best).
+
+`python scripts/results/toy_modes.py`: {steps} steps of batch {batch} for each; the student's come after its teacher's.
+{samples} samples a row, the same noise in each. {seconds:.0f} s of wall time with one thread, torch {torch}.
+"""
+
+if __name__ == "__main__":
+    main()
