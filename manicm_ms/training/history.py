@@ -83,12 +83,12 @@ def _finished(out: Path, folder: Path) -> History:
 def _under_way(out: Path, folder: Path) -> History:
     run, record = _read(folder / RUN_FILE) or {}, _read(folder / RECORD_FILE) or {}
     log = read_log(folder / "log.jsonl")
-    known = {key: run[key] for key in ("kind", "seed", "precision", "preset") if key in run}
-    data = {"sha256": run.get("data"), "env_id": run.get("env_spec", {}).get("env_id")}
+    known: dict[str, Any] = {key: run[key] for key in ("kind", "seed", "precision", "preset") if key in run}
+    known["data"] = {"sha256": run.get("data"), "env_id": run.get("env_spec", {}).get("env_id")}
     described: dict[str, Any] = {"policy": run.get("policy", run.get("kind")), "config": {}}
     described |= {key: run[key] for key in ("env_spec", "chunk") if key in run}
     return History(
-        out, False, record.get("description", described), record.get("provenance", {**known, "data": data}),
+        out, False, record.get("description", described), record.get("provenance", known),
         record.get("parameters", {}), record.get("nfe"), record.get("packages", {}),
         int(log[-1]["step"]) if log else 0, record.get("total_steps", run.get("preset", {}).get("steps")), log,
         _kept(out),
