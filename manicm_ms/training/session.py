@@ -17,6 +17,7 @@ from rich.console import Console
 
 from manicm_ms.errors import CheckpointError, ConfigError, OutputExistsError, require_at_least
 from manicm_ms.machine.devices import resolve_device
+from manicm_ms.policies.action_policy import ActionPolicy
 from manicm_ms.policies.checkpoint import description_of, read_manifest, save_checkpoint
 from manicm_ms.policies.parameter_counts import parameters_by_part
 from manicm_ms.provenance import package_versions
@@ -99,6 +100,7 @@ class Session:
         provenance: Mapping[str, Any],
         build: Callable[[], tuple[PolicyObjective, Batches]],
         snapshots: int = 0,
+        on_trained: Callable[[ActionPolicy], None] | None = None,
     ) -> Path:
         """Train and write the checkpoint, or go on with what an earlier process left, or find it all done.
 
@@ -107,6 +109,7 @@ class Session:
             provenance: of the inputs, for the checkpoint.
             build: makes objective and data, the same at each call.
             snapshots: checkpoints kept on the way, at even distances, the last one at the end; see `snapshot_folders`.
+            on_trained: called with the trained policy before its checkpoint is written, where this call trains it.
 
         Returns:
             The checkpoint folder.
@@ -149,6 +152,8 @@ class Session:
                 self._say(f"training state saved in {run.folder}")
                 raise
             if self.fabric.is_global_zero:
+                if on_trained is not None:
+                    on_trained(objective.outcome)
                 save_checkpoint(objective.outcome, self.out, self._record(run, result, provenance))
                 run.drop_state()
             self.fabric.barrier()
