@@ -10,9 +10,12 @@ from typing import TYPE_CHECKING, NamedTuple
 
 from rich.console import Console
 
+from manicm_ms.benchmark.method_names import MethodName, folder_name, read_name
 from manicm_ms.errors import ConfigError, UnknownNameError
+from manicm_ms.policies.configuration import parse_overrides
 from manicm_ms.policies.methods import methods_of
-from manicm_ms.training.presets import STUDENT_PRESETS, preset_for
+from manicm_ms.training.optim import FitConfig
+from manicm_ms.training.presets import STUDENT_PRESETS, StudentPreset, TeacherPreset, preset_for
 
 if TYPE_CHECKING:
     from manicm_ms.policies.action_policy import ActionPolicy
@@ -54,9 +57,9 @@ class Method(ABC):
 
     @property
     def folder(self) -> str:
-        """Name of its folder: with its teacher's, so that the students of two teachers never take one another's."""
-        kind = self.name.partition(":")[0]
-        return kind if self.made_from is None else f"{kind}-{self.made_from.name}"
+        """Name of its folder: with its overrides and its teacher's, so that no two ever take one another's."""
+        own = folder_name(read_name(self.name))
+        return own if self.made_from is None else f"{own}-{self.made_from.folder}"
 
     @property
     def made_from(self) -> Method | None:
@@ -73,6 +76,13 @@ class Method(ABC):
         """The method whose checkpoint it plays with: itself, or what it is made from where it does not train."""
         return self if self.trains or self.made_from is None else self.made_from
 
+    def preset(self, size: str) -> FitConfig | None:
+        """Return the preset called `size` with its overrides; None where it does not train.
+
+        Raises UnknownNameError or ConfigError where an override names no key, or a value does not fit.
+        """
+        return None
+
     @abstractmethod
     def train(self, out: Path, source: Path | None, training: Training) -> None:
         """Write the checkpoint `out`; `source` is that of `made_from`."""
@@ -87,18 +97,29 @@ class Trained(Method):
     """What is trained on demonstrations: a row of the table of methods, with all its network evaluations.
 
     Attributes:
-        name: in `METHODS`.
+        name: in `METHODS`, with overrides of its configuration, if any, in brackets.
     """
 
     name: str
+
+    @property
+    def row(self) -> str:
+        """Its name in `METHODS`."""
+        return read_name(self.name).kind
+
+    def preset(self, size: str) -> TeacherPreset:
+        """See `Method.preset`."""
+        changed = preset_for(self.row, size).with_changes(parse_overrides(read_name(self.name).overrides))
+        changed.configuration(self.row)
+        return changed
 
     def train(self, out: Path, source: Path | None, training: Training) -> None:
         """See `Method.train`."""
         from manicm_ms.training.train import train
 
         train(
-            self.name, training.data, out, preset_for(self.name, training.preset), device=training.device,
-            seed=training.seed, snapshots=training.snapshots, console=training.console, command=training.command,
+            self.row, training.data, out, self.preset(training.preset), device=training.device, seed=training.seed,
+            snapshots=training.snapshots, console=training.console, command=training.command,
         )  # fmt: skip
 
     def load(self, checkpoint: Path, device: str) -> Policy:
@@ -152,15 +173,19 @@ class Student(Method):
         """See `Method.made_from`."""
         return self.teacher
 
+    def preset(self, size: str) -> StudentPreset:
+        """See `Method.preset`."""
+        start = replace(STUDENT_PRESETS.get(size), nfe=self.nfe)
+        return start.with_changes(parse_overrides(read_name(self.name).overrides))
+
     def train(self, out: Path, source: Path | None, training: Training) -> None:
         """See `Method.train`."""
         from manicm_ms.training.distill import distill
 
         assert source is not None
         distill(
-            source, training.data, out, replace(STUDENT_PRESETS.get(training.preset), nfe=self.nfe),
-            device=training.device, seed=training.seed, snapshots=training.snapshots, console=training.console,
-            command=training.command,
+            source, training.data, out, self.preset(training.preset), device=training.device, seed=training.seed,
+            snapshots=training.snapshots, console=training.console, command=training.command,
         )  # fmt: skip
 
     def load(self, checkpoint: Path, device: str) -> Policy:
@@ -193,31 +218,37 @@ def parse_methods(names: Sequence[str]) -> tuple[Method, ...]:
     """Return the methods of these names, in their order.
 
     "manicm" is distilled from the one teacher among the names, or from simple_dp3 where there is none; with several,
-    "manicm:dp3" says from which.
+    "manicm:dp3" says from which. Brackets hold overrides, as `--set` takes them, separated by semicolons:
+    "simple_dp3[head.prediction_type=epsilon]", "manicm[training.solver_stride=20]:dp3[training.steps=3000]".
 
     Raises:
         UnknownNameError: no such method or teacher.
         ConfigError: none, one named twice, or a method whose teacher is not clear.
     """
-    teachers = [name for name in names if name in methods_of("teacher")]
-    if not names or len(set(names)) < len(names):
+    read = [read_name(name) for name in names]
+    teachers = [str(name) for name in read if name.kind in methods_of("teacher")]
+    if not names or len(set(read)) < len(read):
         raise ConfigError(f"name each method once, of {', '.join(method_names())}; got {', '.join(names) or 'none'}")
-    return tuple(_method(name, teachers) for name in names)
+    return tuple(_method(name, teachers) for name in read)
 
 
-def _method(name: str, teachers: Sequence[str]) -> Method:
-    kind, _, teacher = name.partition(":")
+def _method(name: MethodName, teachers: Sequence[str]) -> Method:
     known = method_names()
-    if kind not in known:
-        raise UnknownNameError("method", name, known)
-    if kind not in _MADE_FROM_TEACHER:
-        if teacher:
-            raise ConfigError(f"{kind} is trained on demonstrations, not made from {teacher}: use {kind!r}")
-        return Trained(kind)
-    if not teacher and len(teachers) > 1:
-        raise ConfigError(f"{kind} of which teacher? write {' or '.join(f'{kind}:{t}' for t in teachers)}")
-    chosen = teacher or (teachers[0] if teachers else DEFAULT_TEACHER)
+    if name.kind not in known:
+        raise UnknownNameError("method", name.kind, known)
+    if name.kind not in _MADE_FROM_TEACHER:
+        if name.teacher:
+            raise ConfigError(
+                f"{name.kind} is trained on demonstrations, not made from {name.teacher}: use {name.kind!r}"
+            )
+        return Trained(str(name))
+    if not name.teacher and len(teachers) > 1:
+        raise ConfigError(f"{name.kind} of which teacher? write {' or '.join(f'{name.kind}:{t}' for t in teachers)}")
+    chosen = read_name(name.teacher or (teachers[0] if teachers else DEFAULT_TEACHER))
     possible = methods_of("teacher")
-    if chosen not in possible:
-        raise UnknownNameError("teacher", chosen, possible)
-    return _MADE_FROM_TEACHER[kind](Trained(chosen), name)
+    if chosen.kind not in possible:
+        raise UnknownNameError("teacher", chosen.kind, possible)
+    method = _MADE_FROM_TEACHER[name.kind](Trained(str(chosen)), str(name))
+    if name.overrides and method.preset("smoke") is None:
+        raise ConfigError(f"{name.kind} is not trained, so that nothing of it can be overridden: write {name.kind!r}")
+    return method
