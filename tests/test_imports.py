@@ -31,7 +31,8 @@ ALLOWED = {
     "policies": set(),
     "training": {"demos", "policies", "machine"},
     "evaluation": {"envs", "policies", "machine", "sensing"},
-    "bench": {"envs", "robots", "demos", "policies", "evaluation", "machine", "sensing"},
+    "reports": {"policies", "training", "evaluation"},
+    "bench": {"envs", "robots", "demos", "policies", "training", "evaluation", "machine", "sensing"},
     "benchmark": {"envs", "demos", "policies", "training", "evaluation", "machine"},
 }
 MAY_SIMULATE = {"robots", "envs", "tasks", "machine", "bench"}

@@ -11,9 +11,12 @@ from typing import TYPE_CHECKING, NamedTuple
 
 from rich.console import Console
 
+from manicm_ms.benchmark.method_names import MethodName, folder_name, read_name
 from manicm_ms.errors import ConfigError, UnknownNameError
+from manicm_ms.policies.configuration import parse_overrides
 from manicm_ms.policies.methods import METHODS, STUDENT, head_with_nfe, methods_of
-from manicm_ms.training.presets import STUDENT_PRESETS, preset_for
+from manicm_ms.training.optim import FitConfig
+from manicm_ms.training.presets import STUDENT_PRESETS, StudentPreset, TeacherPreset, preset_for
 
 if TYPE_CHECKING:
     from manicm_ms.policies.action_policy import ActionPolicy
@@ -55,9 +58,9 @@ class Method(ABC):
 
     @property
     def folder(self) -> str:
-        """Name of its folder: with its teacher's, so that the students of two teachers never take one another's."""
-        kind = self.name.partition(":")[0]
-        return kind if self.made_from is None else f"{kind}-{self.made_from.name}"
+        """Name of its folder: with its overrides and its teacher's, so that no two ever take one another's."""
+        own = folder_name(read_name(self.name))
+        return own if self.made_from is None else f"{own}-{self.made_from.folder}"
 
     @property
     def made_from(self) -> Method | None:
@@ -74,6 +77,13 @@ class Method(ABC):
         """The method whose checkpoint it plays with: itself, or what it is made from where it does not train."""
         return self if self.trains or self.made_from is None else self.made_from
 
+    def preset(self, size: str) -> FitConfig | None:
+        """Return the preset called `size` with its overrides; None where it does not train.
+
+        Raises UnknownNameError or ConfigError where an override names no key, or a value does not fit.
+        """
+        return None
+
     @abstractmethod
     def train(self, out: Path, source: Path | None, training: Training) -> None:
         """Write the checkpoint `out`; `source` is that of `made_from`."""
@@ -88,18 +98,29 @@ class Trained(Method):
     """What is trained on demonstrations: a row of the table of methods, with all its network evaluations.
 
     Attributes:
-        name: in `METHODS`.
+        name: in `METHODS`, with overrides of its configuration, if any, in brackets.
     """
 
     name: str
+
+    @property
+    def row(self) -> str:
+        """Its name in `METHODS`."""
+        return read_name(self.name).kind
+
+    def preset(self, size: str) -> TeacherPreset:
+        """See `Method.preset`."""
+        changed = preset_for(self.row, size).with_changes(parse_overrides(read_name(self.name).overrides))
+        changed.configuration(self.row)
+        return changed
 
     def train(self, out: Path, source: Path | None, training: Training) -> None:
         """See `Method.train`."""
         from manicm_ms.training.train import train
 
         train(
-            self.name, training.data, out, preset_for(self.name, training.preset), device=training.device,
-            seed=training.seed, snapshots=training.snapshots, console=training.console, command=training.command,
+            self.row, training.data, out, self.preset(training.preset), device=training.device, seed=training.seed,
+            snapshots=training.snapshots, console=training.console, command=training.command,
         )  # fmt: skip
 
     def load(self, checkpoint: Path, device: str) -> Policy:
@@ -151,15 +172,19 @@ class Student(Method):
         """See `Method.made_from`."""
         return self.teacher
 
+    def preset(self, size: str) -> StudentPreset:
+        """See `Method.preset`."""
+        start = replace(STUDENT_PRESETS.get(size), nfe=1)
+        return start.with_changes(parse_overrides(read_name(self.name).overrides))
+
     def train(self, out: Path, source: Path | None, training: Training) -> None:
         """See `Method.train`."""
         from manicm_ms.training.distill import distill
 
         assert source is not None
         distill(
-            source, training.data, out, replace(STUDENT_PRESETS.get(training.preset), nfe=1),
-            device=training.device, seed=training.seed, snapshots=training.snapshots, console=training.console,
-            command=training.command,
+            source, training.data, out, self.preset(training.preset), device=training.device, seed=training.seed,
+            snapshots=training.snapshots, console=training.console, command=training.command,
         )  # fmt: skip
 
     def load(self, checkpoint: Path, device: str) -> Policy:
@@ -188,7 +213,7 @@ class Steps(Method):
     @property
     def folder(self) -> str:
         """See `Method.folder`."""
-        return f"{self.name.partition(':')[0]}-{(self.method.made_from or self.method).name}"
+        return f"{folder_name(read_name(self.name))}-{(self.method.made_from or self.method).folder}"
 
     @property
     def trains(self) -> bool:
@@ -225,54 +250,59 @@ def parse_methods(names: Sequence[str]) -> tuple[Method, ...]:
     A student is distilled from the one teacher among the names that its row is made for; manicm else from any that is
     named. With several, "manicm:dp3" says from which, and with none it is the first that its row names.
     A number behind a name is that of network evaluations: "simple_dp3_4" plays with the checkpoint of simple_dp3.
+    Brackets hold overrides, as `--set` takes them, separated by semicolons: "simple_dp3[head.prediction_type=epsilon]",
+    "manicm[training.solver_stride=20]:dp3[training.steps=3000]".
 
     Raises:
         UnknownNameError: no such method or teacher.
         ConfigError: none, one named twice, one whose teacher is not clear, or one that cannot be evaluated so often.
     """
-    if not names or len(set(names)) < len(names):
+    read = [read_name(name) for name in names]
+    teachers = [name for name in read if name.kind in methods_of("teacher")]
+    if not names or len(set(read)) < len(read):
         raise ConfigError(f"name each method once, of {', '.join(method_names())}; got {', '.join(names) or 'none'}")
-    teachers = [name for name in names if name in methods_of("teacher")]
-    return tuple(_method(name, teachers) for name in names)
+    return tuple(_method(name, teachers) for name in read)
 
 
 _WITH_STEPS = re.compile(r"(?P<kind>\w+)_(?P<nfe>[1-9]\d*)")
 
 
-def _method(name: str, teachers: Sequence[str]) -> Method:
-    kind, colon, teacher = name.partition(":")
-    known = method_names()
+def _method(name: MethodName, teachers: Sequence[MethodName]) -> Method:
+    known, kind = method_names(), name.kind
     if kind not in known and (steps := _WITH_STEPS.fullmatch(kind)) and steps["kind"] in known:
-        return _with_steps(name, steps["kind"], colon + teacher, int(steps["nfe"]), teachers)
+        return _with_steps(name, steps["kind"], int(steps["nfe"]), teachers)
     if kind not in known:
-        raise UnknownNameError("method", name, known)
+        raise UnknownNameError("method", kind, known)
     if kind == ONE_STEP:
-        return OneStep(name, _teacher_of(kind, teacher, teachers))
+        if name.overrides:
+            raise ConfigError(f"{kind} is not trained, so that nothing of it can be overridden: write {kind!r}")
+        return OneStep(str(name), _teacher_of(name, teachers))
     if kind in methods_of("student"):
-        return Student(name, _teacher_of(kind, teacher, teachers))
-    if teacher:
-        raise ConfigError(f"{kind} is trained on demonstrations, not made from {teacher}: use {kind!r}")
-    return Trained(kind)
+        return Student(str(name), _teacher_of(name, teachers))
+    if name.teacher:
+        raise ConfigError(f"{kind} is trained on demonstrations, not made from {name.teacher}: use {kind!r}")
+    return Trained(str(name))
 
 
-def _with_steps(name: str, kind: str, teacher: str, nfe: int, teachers: Sequence[str]) -> Steps:
-    method = _method(f"{kind}{teacher}", teachers)
+def _with_steps(name: MethodName, kind: str, nfe: int, teachers: Sequence[MethodName]) -> Steps:
+    method = _method(name._replace(kind=kind), teachers)
     if isinstance(method, OneStep):
         raise ConfigError(f"{kind} is evaluated once a decision: to evaluate a teacher {nfe} times write TEACHER_{nfe}")
     assert isinstance(method, Trained | Student)
     head_with_nfe(kind, nfe)
-    return Steps(name, method, nfe)
+    return Steps(str(name), method, nfe)
 
 
-def _teacher_of(kind: str, named: str, teachers: Sequence[str]) -> Trained:
+def _teacher_of(name: MethodName, teachers: Sequence[MethodName]) -> Trained:
     """Return what a method is made from: the teacher that it names, or that follows from those named beside it."""
+    kind = name.kind
     own = METHODS.get(kind).teachers if kind != ONE_STEP else ()
     any_teacher = kind in (ONE_STEP, STUDENT)
-    likely = [teacher for teacher in teachers if teacher in own] or (list(teachers) if any_teacher else [])
-    if not named and len(likely) > 1:
+    likely = [str(t) for t in teachers if t.kind in own] or ([str(t) for t in teachers] if any_teacher else [])
+    if not name.teacher and len(likely) > 1:
         raise ConfigError(f"{kind} of which teacher? write {' or '.join(f'{kind}:{t}' for t in likely)}")
-    chosen = named or (likely[0] if likely else own[0] if own else DEFAULT_TEACHER)
+    chosen = read_name(name.teacher or (likely[0] if likely else own[0] if own else DEFAULT_TEACHER))
     possible = methods_of("teacher")
-    if chosen not in possible:
-        raise UnknownNameError("teacher", chosen, possible)
-    return Trained(chosen)
+    if chosen.kind not in possible:
+        raise UnknownNameError("teacher", chosen.kind, possible)
+    return Trained(str(chosen))

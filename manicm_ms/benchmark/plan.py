@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -76,14 +77,15 @@ class Plan:
             raise ConfigError(
                 "demos, episodes, evaluation_episodes and num_envs must be at least 1, evaluations at least 0"
             )
-        steps = [preset.steps for preset in (TEACHER_PRESETS.get(self.preset), STUDENT_PRESETS.get(self.preset))]
+        trained = [preset for method in self.parsed_methods if (preset := method.preset(self.preset)) is not None]
+        presets = (TEACHER_PRESETS.get(self.preset), STUDENT_PRESETS.get(self.preset), *trained)
+        steps = [preset.steps for preset in presets]
         most = min((s for s in steps if s is not None), default=self.evaluations)
         if self.evaluations and not HIGHEST <= self.evaluations <= most:
             raise ConfigError(
                 f"evaluations must be 0, or from {HIGHEST} (of which the mean is taken) to {most} (steps of the preset "
                 f"{self.preset}), got {self.evaluations}"
             )
-        _ = self.parsed_methods
 
     def require_unseen(self, demonstrated: Sequence[int]) -> None:
         """Raise ConfigError where a seed that a policy is to be evaluated on is among those of its demonstrations."""
@@ -185,5 +187,12 @@ def parse_seeds(text: str) -> tuple[int, ...]:
 
 
 def split_names(text: str) -> Sequence[str]:
-    """Return the words of a comma-separated list."""
-    return tuple(w.strip() for w in text.split(",") if w.strip())
+    """Return the names of a comma-separated list; commas within brackets belong to a name.
+
+    Raises ConfigError where a bracket has no partner.
+    """
+    outside = re.sub(r"\[[^\[\]]*\]", "", text)
+    if "[" in outside or "]" in outside:
+        raise ConfigError(f"a bracket of {text!r} has no partner: write NAME[KEY=VALUE]")
+    words = re.findall(r"(?:[^,\[\]]|\[[^\[\]]*\])+", text)
+    return tuple(w.strip() for w in words if w.strip())

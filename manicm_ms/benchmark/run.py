@@ -10,7 +10,7 @@ from rich.console import Console
 
 from manicm_ms.benchmark.jobs import Job, all_jobs
 from manicm_ms.benchmark.plan import Plan
-from manicm_ms.benchmark.pool import run_in_processes
+from manicm_ms.benchmark.pool import run_in_processes, work_off
 from manicm_ms.benchmark.report import interval_lines, paired_lines, rich_tables, write_benchmark
 from manicm_ms.benchmark.table import compile_table, measure_decisions
 from manicm_ms.demos.experts import EXPERTS
@@ -33,7 +33,7 @@ def benchmark(
 
     Args:
         plan: the grid.
-        processes: that work at once, where `ray` is None.
+        processes: that work at once, where `ray` is None; 0: this process does the work itself.
         ray: address of a Ray cluster that does the work instead.
         command: for the report.
         console: where progress and table are printed.
@@ -47,7 +47,7 @@ def benchmark(
         BackendError: no Ray, or no cluster.
     """
     console = console or Console()
-    if processes < 1:
+    if processes < 0:
         raise ConfigError(f"--processes must be at least 1, got {processes}")
     for env_id in plan.env_ids:
         entry = ENVS.get(env_id)
@@ -72,6 +72,8 @@ def benchmark(
                 from manicm_ms.benchmark.ray_cluster import run_on_ray
 
                 run_on_ray(plan, ray, report)
+            elif not processes:
+                work_off(plan, shown.console)
             else:
                 for trouble in run_in_processes(plan, processes, report):
                     shown.console.print(trouble, style="red", markup=False, highlight=False)

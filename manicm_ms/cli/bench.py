@@ -13,7 +13,7 @@ from typing import Literal
 import tyro
 
 from manicm_ms.cli import USER_ERROR
-from manicm_ms.cli.counts import Count, Seed, checked
+from manicm_ms.cli.counts import Count, OptionalCount, Seed, checked
 from manicm_ms.cli.messages import PROGRAM
 from manicm_ms.cli.options import this_command
 from manicm_ms.errors import ConfigError, UnknownNameError
@@ -149,7 +149,44 @@ def suites_command(tag: str = "benchmark31", write: bool = False, records: Path 
     bench(tag, write, records)
 
 
-COMMANDS: dict[str, Callable[..., None]] = {
+def overfit_command(
+    method: tyro.conf.Positional[str],
+    size: str = "paper",
+    steps: Count = 5,
+    data: tuple[Path, ...] = (),
+    env: str = "metaworld/button-press",
+    episodes: Count = 2,
+    teacher: str | None = None,
+    batch_size: OptionalCount = None,
+    device: str = "cpu",
+    seed: Seed = 0,
+    folder: Path = Path("runs/overfit"),
+) -> int:
+    """Take a few steps with a method at full size on real demonstrations, save, load, and compare the actions.
+
+    Tells parameters by part, seconds a step, peak memory and loss. A method that learns from a teacher is distilled
+    from one of the same size that took one step. The exit status is 1 where the loaded policy acts otherwise.
+
+    Args:
+        method: 'manicm-ms list policies' shows them.
+        size: smoke, quick or paper.
+        steps: of the optimizer.
+        data: stores of demonstrations; by default some are collected.
+        env: environment of which they are collected.
+        episodes: that are collected.
+        teacher: method that a student is distilled from; by default the first with its encoder and backbone.
+        batch_size: windows a step; by default the preset's.
+        device: torch device.
+        seed: of weights, batches and noise.
+        folder: of the collected store and METHOD-SIZE.json.
+    """
+    from manicm_ms.bench.overfit import Options, bench
+
+    options = Options(method, size, steps, data, env, episodes, teacher, batch_size, device, seed, folder)
+    return 0 if bench(options, this_command()) else 1
+
+
+COMMANDS: dict[str, Callable[..., int | None]] = {
     "env": env_command,
     "latency": latency_command,
     "expert": expert_command,
@@ -157,6 +194,7 @@ COMMANDS: dict[str, Callable[..., None]] = {
     "depth": depth_command,
     "calibration": calibration_command,
     "suites": suites_command,
+    "overfit": overfit_command,
 }
 
 

@@ -36,7 +36,8 @@ def benchmark_command(
     Args:
         envs: environment ids and tags, separated by commas; 'manicm-ms list envs' shows both.
         methods: separated by commas: what 'manicm-ms list policies' shows, and one_step (a teacher undistilled); with
-            two teachers, manicm:dp3 says of which. simple_dp3_4 is simple_dp3 evaluated 4 times a decision.
+            two teachers, manicm:dp3 says of which. simple_dp3_4 is simple_dp3 evaluated 4 times a decision. Brackets
+            hold overrides, as --set takes them, separated by semicolons: 'simple_dp3[head.prediction_type=epsilon]'.
         seeds: of the trainings, separated by commas.
         preset: preset of teacher and student; 'manicm-ms list presets' shows them.
         out: folder of everything that is made.

@@ -5,9 +5,10 @@ from __future__ import annotations
 import io
 import re
 from collections.abc import Mapping, Sequence
-from typing import Any
+from typing import Any, NamedTuple
 
 from matplotlib.figure import Figure
+from matplotlib.ticker import MaxNLocator
 
 from manicm_ms.evaluation.results import INTERVALS
 from manicm_ms.evaluation.text import format_ms
@@ -106,3 +107,65 @@ def _svg(figure: Figure, description: str) -> str:
     svg = svg[svg.index("<svg") :].replace(_INK, "currentColor")
     svg = re.sub(r"<metadata>.*?</metadata>", "", svg, flags=re.DOTALL)
     return svg.replace("<svg", f'<svg role="img" aria-label="{description}"', 1)
+
+
+class Line(NamedTuple):
+    """Values over the steps of a training.
+
+    Attributes:
+        steps: (N,) optimizer steps.
+        values: (N,) at these steps.
+        intervals: (N,) lowest and highest, or none.
+    """
+
+    steps: Sequence[float]
+    values: Sequence[float]
+    intervals: Sequence[tuple[float, float]] = ()
+
+
+class Panel(NamedTuple):
+    """Lines that share a vertical axis.
+
+    Attributes:
+        label: of that axis.
+        lines: name -> line.
+        log: whether the axis is logarithmic.
+    """
+
+    label: str
+    lines: Mapping[str, Line]
+    log: bool = False
+
+
+LINE_COLORS = ("#3b76c4", "#e07b39", "#5b9a68", "#8c5fb0", "#b0893b")
+
+
+def curves_plot(panels: Sequence[Panel], description: str) -> str:
+    """Return an SVG of panels one below the other over the same steps; names are told where a panel has several."""
+    figure = Figure(figsize=(7.4, 0.5 + 2.0 * len(panels)), layout="constrained")
+    for axes, panel in zip(figure.subplots(len(panels), 1, sharex=True, squeeze=False)[:, 0], panels, strict=True):
+        for k, (name, line) in enumerate(panel.lines.items()):
+            color = LINE_COLORS[k % len(LINE_COLORS)]
+            axes.plot(line.steps, line.values, color=color, lw=1.6, marker="o", ms=3 if len(line.steps) < 30 else 0,
+                      label=name)  # fmt: skip
+            if line.intervals:
+                axes.fill_between(line.steps, *zip(*line.intervals, strict=True), color=color, alpha=0.15, lw=0)
+        if panel.log:
+            axes.set_yscale("log")
+        _plain_axes(axes, panel.label)
+        if len(panel.lines) > 1:
+            axes.legend(frameon=False, labelcolor=_INK)
+    axes.xaxis.set_major_locator(MaxNLocator(integer=True))
+    axes.set_xlabel("optimizer steps")
+    axes.xaxis.label.set_color(_INK)
+    return _svg(figure, description)
+
+
+def _plain_axes(axes: Any, label: str) -> None:
+    axes.spines[["top", "right"]].set_visible(False)
+    axes.spines[["bottom", "left"]].set_color(_INK)
+    axes.tick_params(colors=_INK, which="both")
+    axes.set_ylabel(label, color=_INK)
+    axes.grid(color=_INK, alpha=0.12, lw=0.8)
+    axes.set_axisbelow(True)
+    axes.patch.set_alpha(0)

@@ -72,18 +72,22 @@ def save_checkpoint(
         raise OutputExistsError(f"{folder} holds something other than a checkpoint: choose another folder")
     tensors = _stored(policy, WEIGHTS_DTYPES[dtype])
     require_free_space(folder, sum(t.nbytes for t in tensors.values()) + (1 << 20))
-    description = {
+    with _disk_errors(folder), replaced_folder(folder) as fresh:
+        save_file(tensors, fresh / _MODEL)
+        (fresh / _MODEL).chmod(0o644)
+        write_json(fresh / _CONFIG, description_of(policy))
+        write_text(fresh / _CARD, model_card(policy, _plain(provenance), dtype))
+        write_json(fresh / _MANIFEST, _manifest(fresh, policy.name, dtype, _plain(provenance)))
+
+
+def description_of(policy: ActionPolicy) -> dict[str, Any]:
+    """Return what config.json says of a policy, JSON values: everything but its weights."""
+    return {
         "policy": policy.name,
         "config": policy.config_dict(),
         "env_spec": policy.spec.to_dict(),
         "chunk": asdict(policy.chunk),
     }
-    with _disk_errors(folder), replaced_folder(folder) as fresh:
-        save_file(tensors, fresh / _MODEL)
-        (fresh / _MODEL).chmod(0o644)
-        write_json(fresh / _CONFIG, description)
-        write_text(fresh / _CARD, model_card(policy, _plain(provenance), dtype))
-        write_json(fresh / _MANIFEST, _manifest(fresh, policy.name, dtype, _plain(provenance)))
 
 
 def read_manifest(folder: Path) -> dict[str, Any]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from pathlib import Path
 
 from rich.console import Console
@@ -38,6 +39,7 @@ def distill(
     command: str | None = None,
     snapshots: int = 0,
     allow_other_task: bool = False,
+    on_trained: Callable[[ActionPolicy], None] | None = None,
 ) -> Path:
     """Distil a teacher and write the student's checkpoint; the same call goes on after a kill.
 
@@ -55,6 +57,7 @@ def distill(
         console: for progress; standard error by default.
         command: the command line, for the record; this process's by default.
         snapshots: checkpoints to keep on the way, at even distances; see `snapshot_folders`.
+        on_trained: called with the trained policy, still in memory, before its checkpoint is written.
         allow_other_task: distil on demonstrations of another task than the teacher's, which is refused otherwise.
 
     Returns:
@@ -90,7 +93,7 @@ def distill(
     weights = manifest["files"]["model.safetensors"]["sha256"]
     inputs = {"teacher": weights, "data": demos.provenance["sha256"], "preset": preset_identity(preset)}
     made_from = {"path": str(teacher), "sha256": weights, "provenance": manifest["provenance"]}
-    return session.complete(inputs, {"data": demos.provenance, "teacher": made_from}, build, snapshots)
+    return session.complete(inputs, {"data": demos.provenance, "teacher": made_from}, build, snapshots, on_trained)
 
 
 def _load_teacher(folder: Path) -> ActionPolicy:

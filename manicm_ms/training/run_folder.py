@@ -5,6 +5,7 @@
     runs/teacher/                the checkpoint, written once, at the end
     runs/teacher.train/
       run.json                   what is being trained: the same identity may go on, another may not
+      record.json                what is known at the start: configuration, data, command, number of steps
       state.safetensors          the latest training state, one file, replaced atomically; gone at the end
       log.jsonl                  a line every few steps
       tensorboard/               the same numbers
@@ -29,6 +30,8 @@ from torch import Tensor
 
 from manicm_ms.errors import CheckpointError, NoSpaceError, OutputExistsError
 from manicm_ms.paths import exclusive_lock, is_disk_full, write_json
+
+RUN_FILE, RECORD_FILE = "run.json", "record.json"
 
 
 def fingerprint(identity: Mapping[str, Any]) -> str:
@@ -78,7 +81,7 @@ class RunFolder:
 
     def claim(self) -> None:
         """Write the identity, or raise OutputExistsError where another run's stands there."""
-        path = self.folder / "run.json"
+        path = self.folder / RUN_FILE
         if not path.exists():
             write_json(path, self.identity)
             return
@@ -93,6 +96,10 @@ class RunFolder:
                 f"{self.out} already holds another run ({'; '.join(differences[:3])}): choose another --out, "
                 f"or delete {self.out} and {self.folder} to start over"
             )
+
+    def note(self, record: Mapping[str, Any]) -> None:
+        """Write down what is known before the first step, JSON values; a run that goes on says it anew."""
+        write_json(self.folder / RECORD_FILE, record)
 
     def save_state(self, tensors: Mapping[str, Tensor], meta: Mapping[str, Any]) -> None:
         """Replace the training state; a kill at any moment leaves the old or the new one, whole.

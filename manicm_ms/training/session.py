@@ -17,13 +17,16 @@ from rich.console import Console
 
 from manicm_ms.errors import CheckpointError, ConfigError, OutputExistsError, require_at_least
 from manicm_ms.machine.devices import resolve_device
-from manicm_ms.policies.checkpoint import read_manifest, save_checkpoint
+from manicm_ms.policies.action_policy import ActionPolicy
+from manicm_ms.policies.checkpoint import description_of, read_manifest, save_checkpoint
+from manicm_ms.policies.parameter_counts import parameters_by_part
+from manicm_ms.provenance import package_versions
 from manicm_ms.training.demonstrations import Demos
 from manicm_ms.training.device import make_fabric, resolve_precision
 from manicm_ms.training.loop import Batches, FitResult, Snapshots, fit
 from manicm_ms.training.objectives.objective import PolicyObjective
 from manicm_ms.training.optim import FitConfig
-from manicm_ms.training.run_folder import RunFolder, open_run, snapshot_folder, training_folder
+from manicm_ms.training.run_folder import RUN_FILE, RunFolder, open_run, snapshot_folder, training_folder
 
 _NOT_IDENTITY = ("log_every", "save_every", "precision")  # the precision that is used stands beside the preset
 
@@ -97,6 +100,7 @@ class Session:
         provenance: Mapping[str, Any],
         build: Callable[[], tuple[PolicyObjective, Batches]],
         snapshots: int = 0,
+        on_trained: Callable[[ActionPolicy], None] | None = None,
     ) -> Path:
         """Train and write the checkpoint, or go on with what an earlier process left, or find it all done.
 
@@ -105,6 +109,7 @@ class Session:
             provenance: of the inputs, for the checkpoint.
             build: makes objective and data, the same at each call.
             snapshots: checkpoints kept on the way, at even distances, the last one at the end; see `snapshot_folders`.
+            on_trained: called with the trained policy before its checkpoint is written, where this call trains it.
 
         Returns:
             The checkpoint folder.
@@ -129,6 +134,8 @@ class Session:
                 self._say(f"{self.out} is finished: nothing to do")
                 return self.out
             objective, data = build()
+            if self.fabric.is_global_zero:
+                run.note(self._known(run, objective, len(data), provenance))
             try:
                 result = fit(
                     objective,
@@ -145,6 +152,8 @@ class Session:
                 self._say(f"training state saved in {run.folder}")
                 raise
             if self.fabric.is_global_zero:
+                if on_trained is not None:
+                    on_trained(objective.outcome)
                 save_checkpoint(objective.outcome, self.out, self._record(run, result, provenance))
                 run.drop_state()
             self.fabric.barrier()
@@ -166,7 +175,7 @@ class Session:
     def _open(self, identity: Mapping[str, Any]) -> AbstractContextManager[RunFolder]:
         if not self.fabric.is_global_zero:
             return nullcontext(RunFolder(self.out, identity))
-        if not (training_folder(self.out) / "run.json").exists():
+        if not (training_folder(self.out) / RUN_FILE).exists():
             _is_done(RunFolder(self.out, identity))  # refuses what is not ours before anything is written beside it
         return open_run(self.out, identity)
 
@@ -183,6 +192,20 @@ class Session:
             "precision": self.precision,
             "preset": json.loads(json.dumps(asdict(self.preset))),
             **provenance,
+        }
+
+    def _known(
+        self, run: RunFolder, objective: PolicyObjective, samples: int, provenance: Mapping[str, Any]
+    ) -> dict[str, Any]:
+        """Return what can be said of the training before its first step, for a report on it while it goes on."""
+        policy = objective.outcome
+        return {
+            "total_steps": self.preset.total_steps(samples),
+            "description": description_of(policy),
+            "parameters": parameters_by_part(policy),
+            "nfe": policy.nfe,
+            "packages": package_versions(),
+            "provenance": self._record(run, FitResult(0, math.nan, math.nan, 0), provenance),
         }
 
     def _say(self, line: str) -> None:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -36,6 +36,7 @@ def train(
     console: Console | None = None,
     command: str | None = None,
     snapshots: int = 0,
+    on_trained: Callable[[ActionPolicy], None] | None = None,
 ) -> Path:
     """Train a policy and write its checkpoint; the same call goes on after a kill, and returns at once when done.
 
@@ -51,6 +52,7 @@ def train(
         console: for progress; standard error by default.
         command: the command line, for the record; this process's by default.
         snapshots: checkpoints to keep on the way, at even distances; see `snapshot_folders`.
+        on_trained: called with the trained policy, still in memory, before its checkpoint is written.
 
     Returns:
         `out`.
@@ -88,7 +90,7 @@ def train(
         "data": demos.provenance["sha256"],
         "preset": preset_identity(preset, method),
     }
-    return session.complete(inputs, {"data": demos.provenance}, build, snapshots)
+    return session.complete(inputs, {"data": demos.provenance}, build, snapshots, on_trained)
 
 
 def objective_of(method: str) -> OnDemonstrations:

@@ -116,7 +116,7 @@ def test_finished_run_returns_at_once_and_leaves_no_state(pair):
     assert "finished" in run(distill, teacher, data, student, STUDENT)[1]
     assert {p: p.stat().st_mtime_ns for p in before} == before
     assert sorted(p.name for p in (folder / "teacher.train").iterdir()) == [
-        "lock", "log.jsonl", "run.json", "tensorboard",
+        "lock", "log.jsonl", "record.json", "run.json", "tensorboard",
     ]  # fmt: skip
 
 
