@@ -52,7 +52,7 @@ class ActionPolicy(Policy):
         name: of the method.
         spec: the environment that it is made for.
         chunk: To, Tp, Ta.
-        transforms: name -> transform, in order.
+        transforms: name -> transform, in order; those that change nothing that the encoder reads are left out.
         normalizer_config: how the normalizer is fitted.
         encoder: normalised observations to features.
         head: features to normalised chunks.
@@ -75,6 +75,7 @@ class ActionPolicy(Policy):
     ) -> None:
         super().__init__()
         self.name, self.spec, self.chunk = name, spec, chunk
+        transforms = {name: t for name, t in transforms.items() if not t.changes or set(t.changes) & set(encoder.keys)}
         self.keys = tuple(dict.fromkeys([*encoder.keys, *(key for t in transforms.values() for key in t.reads)]))
         self.transforms = torch.nn.ModuleDict(transforms)
         self.normalizer_config = normalizer_config
@@ -167,7 +168,8 @@ class ActionPolicy(Policy):
     def _encoded(self, obs: Obs, read: Callable[[InputTransform, Obs], Obs]) -> Features:
         for transform in self._transforms:
             obs = read(transform, obs)
-        normalized = {key: self.normalizer.normalize(key, obs[key]) for key in self.keys}
+        ranged = self.normalizer.fields
+        normalized = {key: self.normalizer.normalize(key, obs[key]) if key in ranged else obs[key] for key in self.keys}
         for transform in self._transforms:
             normalized = transform.normalized(normalized, obs)
         return self.encoder(normalized)
@@ -287,8 +289,9 @@ def _name_of(registry: Registry[Any], part: Any) -> str:
 
 
 def _channels(spec: EnvSpec, keys: tuple[str, ...]) -> dict[str, int]:
-    """Return the channels of what is normalised: the last axis of each observation, and the actions."""
-    shapes = {key: spec.observation(key).shape for key in keys}
+    """Return the channels of what is normalised by its range: the last axis of each observation, and the actions."""
+    fields = {key: spec.observation(key) for key in keys}
+    shapes = {key: field.shape for key, field in fields.items() if field.by_range}
     if unfit := [key for key, shape in shapes.items() if shape[-1] == ANY]:
         raise ConfigError(f"{', '.join(unfit)} has no fixed number of channels, so that it cannot be normalised")
     return {**{key: shape[-1] for key, shape in shapes.items()}, ACTION: spec.action.dim}

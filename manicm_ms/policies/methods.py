@@ -170,6 +170,36 @@ METHODS.add(
     ),
 )
 METHODS.add(
+    "dp",
+    Method(
+        sentence="Diffusion Policy from images: its hybrid ResNet-18 encoder on DP3's protocol, predicting noise.",
+        reference="Chi et al. 2023, Diffusion Policy, arXiv:2303.04137",
+        encoder="image",
+        backbone="unet1d",
+        head={NAME: "diffusion", "prediction_type": "epsilon"},
+        objective="averaged",
+        nfe=10,
+        chunk=ChunkSpec(2, 4, 3),
+        size_chunks=_PAPER,
+        inputs={"image_crop": {}},
+    ),
+)
+METHODS.add(
+    "voxel_dp",
+    Method(
+        sentence="DP3's teacher from voxel grids: eight 3D convolutions in place of the encoder of clouds.",
+        reference="encoder: Wang et al. 2024, Equivariant Diffusion Policy, arXiv:2407.01812",
+        encoder="voxel",
+        backbone="unet1d",
+        head="diffusion",
+        objective="averaged",
+        nfe=10,
+        chunk=ChunkSpec(2, 4, 3),
+        size_chunks=_PAPER,
+        inputs={"voxel_crop": {}},
+    ),
+)
+METHODS.add(
     STUDENT,
     Method(
         sentence="ManiCM's student, distilled from either teacher: evaluated once a decision.",
