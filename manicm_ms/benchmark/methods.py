@@ -12,11 +12,12 @@ from rich.console import Console
 
 from manicm_ms.errors import ConfigError, UnknownNameError
 from manicm_ms.policies.methods import methods_of
-from manicm_ms.training.presets import STUDENT_PRESETS, preset_for
+from manicm_ms.training.presets import CHUNK, STUDENT_PRESETS, preset_for
 
 if TYPE_CHECKING:
     from manicm_ms.policies.action_policy import ActionPolicy
     from manicm_ms.policies.policy import Policy
+    from manicm_ms.spec import EnvSpec
 
 DEFAULT_TEACHER = "simple_dp3"
 
@@ -73,6 +74,11 @@ class Method(ABC):
         """The method whose checkpoint it plays with: itself, or what it is made from where it does not train."""
         return self if self.trains or self.made_from is None else self.made_from
 
+    def reads(self, preset: str, spec: EnvSpec) -> tuple[str, ...]:
+        """Return the observations that its training reads, where it learns from demonstrations alone."""
+        del preset, spec
+        return ()
+
     @abstractmethod
     def train(self, out: Path, source: Path | None, training: Training) -> None:
         """Write the checkpoint `out`; `source` is that of `made_from`."""
@@ -91,6 +97,13 @@ class Trained(Method):
     """
 
     name: str
+
+    def reads(self, preset: str, spec: EnvSpec) -> tuple[str, ...]:
+        """See `Method.reads`."""
+        from manicm_ms.policies.action_policy import keys_read
+
+        config = preset_for(self.name, preset).configuration(self.name)
+        return keys_read({key: value for key, value in config.items() if key != CHUNK}, spec)
 
     def train(self, out: Path, source: Path | None, training: Training) -> None:
         """See `Method.train`."""

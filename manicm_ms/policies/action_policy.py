@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from typing import Any, ClassVar, NamedTuple
 
@@ -75,8 +75,8 @@ class ActionPolicy(Policy):
     ) -> None:
         super().__init__()
         self.name, self.spec, self.chunk = name, spec, chunk
-        transforms = {name: t for name, t in transforms.items() if not t.changes or set(t.changes) & set(encoder.keys)}
-        self.keys = tuple(dict.fromkeys([*encoder.keys, *(key for t in transforms.values() for key in t.reads)]))
+        transforms = _effective(transforms, encoder.keys)
+        self.keys = _keys(encoder.keys, transforms)
         self.transforms = torch.nn.ModuleDict(transforms)
         self.normalizer_config = normalizer_config
         self.normalizer = normalizer if normalizer is not None else Normalizer(_channels(spec, self.keys))
@@ -228,6 +228,13 @@ def read_parts(config: Nested) -> Parts:
     return Parts(transforms, fitted, encoder, backbone, head)
 
 
+def keys_read(config: Nested, spec: EnvSpec) -> tuple[str, ...]:
+    """Return the observations that a policy of this configuration reads, without building it; see `ActionPolicy.keys`."""
+    parts = read_parts(config)
+    transforms = {key: kind(fields, spec) for key, (kind, fields) in parts.inputs.items()}
+    return _keys(parts.encoder[0].keys, _effective(transforms, parts.encoder[0].keys))
+
+
 def build_policy(name: str, config: Nested, spec: EnvSpec, chunk: ChunkSpec) -> ActionPolicy:
     """Return the untrained policy that a configuration describes.
 
@@ -260,6 +267,15 @@ def _built(name: str, parts: Parts, spec: EnvSpec, chunk: ChunkSpec) -> ActionPo
         backbone = kind(fields, chunk, spec.action.dim, encoder.shape, head_kind.times)
     head = head_kind(head_fields, backbone, chunk, spec.action.dim, encoder.shape)
     return ActionPolicy(name, spec, chunk, transforms, parts.normalizer, encoder, head)
+
+
+def _effective(transforms: Mapping[str, InputTransform], keys: Sequence[str]) -> dict[str, InputTransform]:
+    """Return the transforms that change something that an encoder of `keys` reads, or say nothing of what they change."""
+    return {name: t for name, t in transforms.items() if not t.changes or set(t.changes) & set(keys)}
+
+
+def _keys(keys: Sequence[str], transforms: Mapping[str, InputTransform]) -> tuple[str, ...]:
+    return tuple(dict.fromkeys([*keys, *(key for t in transforms.values() for key in t.reads)]))
 
 
 def _part(registry: Registry[Any], config: Nested, key: str) -> tuple[Any, Any]:
