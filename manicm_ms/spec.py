@@ -21,8 +21,8 @@ IMAGE = "image"
 DEPTH = "depth"
 """(H, W) float32, metres along the optical axis, 0 where nothing was hit."""
 VOXEL_GRID = "voxel_grid"
-"""(C, V, V, V) uint8: the task's crop box cut into V cells along x, y and z of `ObsSpec.frame`. Channel 0 is 255 where a
-cell holds a point and 0 elsewhere; with coloured clouds C is 4 and the mean r, g, b of the cell's points follow, else 1."""
+"""(C, V, V, V) uint8: the task's crop box cut into V cells along x, y and z of `ObsSpec.frame`. Channel 0 is 255 where
+a cell holds a point and 0 elsewhere; with coloured clouds C is 4, and the mean r, g, b of a cell's points follow."""
 STATE = "state"
 """(S,) float32 privileged state, for experts and critics; `EnvSpec.state_layout` names its parts."""
 ACTION = "action"
@@ -109,8 +109,8 @@ class ObsSpec:
     def request(self, keys: Collection[str]) -> dict[str, Any]:
         """Return what `make_vec` is asked for so that the observations `keys` have these forms: name -> value.
 
-        The size of a picture or a grid is left out where none is read: clouds may be rendered at the picture's size, and
-        are made as ever.
+        The size of a picture or a grid is left out where none is read: clouds may be rendered at the picture's size,
+        and are made as ever.
         """
         asked: dict[str, Any] = {"num_points": self.num_points, "colors": self.point_channels == 6}
         if IMAGE in keys or DEPTH in keys:

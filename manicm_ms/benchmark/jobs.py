@@ -142,7 +142,7 @@ class CollectJob(Job):
             return {"attempts": done.attempts, "episodes": done.episodes, "mean_length": float(store.lengths.mean())}
 
     def _extras(self, path: Path) -> dict[str, Any]:
-        """Return what `collect` is asked for so that the methods find what they read; a store that has more is taken."""
+        """Return what `collect` is asked for so that the methods find what they read; a store may hold more."""
         needed = self.plan.extras(EnvRequest(self.env_id).entry.spec)
         if path.exists():
             with DemoStore.open(path) as store:

@@ -54,8 +54,8 @@ def collect_command(
 
     options = {
         "num_envs": num_envs or default_num_envs(), "seed": seed, "style": style, "backend": backend,
-        "colors": colors, "extras": extras, "voxel_size": voxel_size, "tail_steps": tail_steps, "realism": realism, "camera": camera,
-        "obs_preset": obs_preset,
+        "colors": colors, "extras": extras, "voxel_size": voxel_size, "tail_steps": tail_steps, "realism": realism,
+        "camera": camera, "obs_preset": obs_preset,
     }  # fmt: skip
     if (env_id is None) == (tag is None):
         raise ConfigError("name one environment id, or --tag and a tag ('manicm-ms list envs' shows both)")

@@ -20,6 +20,7 @@ from manicm_ms.errors import ConfigError
 from manicm_ms.sensing.realism import RealismSample
 from manicm_ms.spec import ACTION, STATE
 
+
 @dataclass(frozen=True)
 class Attempt:
     """One seed that was played to its end.

@@ -119,7 +119,7 @@ def store_path(folder: Path, env_id: str) -> Path:
 
 def frame_shapes(spec: EnvSpec) -> dict[str, tuple[tuple[int, ...], np.dtype]]:
     """Return, per field of `Episode`, the shape of one frame and its type."""
-    shapes = {}
+    shapes: dict[str, tuple[tuple[int, ...], np.dtype]] = {}
     for field in FRAME_ARRAYS:
         if field == ACTION:
             shapes[field] = (spec.action.dim,), np.dtype("<f4")

@@ -126,13 +126,13 @@ class JoinedFrames:
         return JoinedFrames([part.to(device) for part in self._parts])
 
 
-def frames_of(store: DemoStore, key: str, most_bytes: int = MOST_HELD_BYTES) -> Tensor | StoredFrames:
-    """Return the committed frames of an observation, or of the actions: in memory, or on the disk where they are large.
+def frames_of(store: DemoStore, key: str, most_bytes: int | None = None) -> Tensor | StoredFrames:
+    """Return the committed frames of an observation, or of the actions, in the type that they are stored in.
 
-    Values keep the type that they are stored in.
+    They are held in memory where they take up to `most_bytes` (None: `MOST_HELD_BYTES`), else they stay on the disk.
     """
     field, count = FIELD_OF_OBS.get(key, key), store.num_frames
-    if store.frame_bytes(field) * count <= most_bytes:
+    if store.frame_bytes(field) * count <= (MOST_HELD_BYTES if most_bytes is None else most_bytes):
         return torch.from_numpy(store.frames(field, 0, count))
     return StoredFrames(partial(store.frames_at, field), count)
 
@@ -156,9 +156,7 @@ class SequenceDataset:
         lengths = {len(values) for values in self.frames.values()}
         if len(lengths) != 1:
             names = list(self.frames)
-            raise ConfigError(
-                f"{', '.join(names[:-1])} and {names[-1]} differ in length: {sorted(lengths)} frames"
-            )
+            raise ConfigError(f"{', '.join(names[:-1])} and {names[-1]} differ in length: {sorted(lengths)} frames")
         if len(self.index) == 0:
             raise ConfigError(
                 f"no window of horizon {self.chunk.horizon} fits into these {max(lengths)} frames of demonstrations: "
@@ -193,11 +191,11 @@ class SequenceDataset:
         store: DemoStore,
         chunk: ChunkSpec,
         keys: Sequence[str] = CLOUD_KEYS,
-        most_bytes: int = MOST_HELD_BYTES,
+        most_bytes: int | None = None,
     ) -> SequenceDataset:
         """Index the windows of `store` and read every committed frame of the observations `keys` and of the actions.
 
-        An observation whose frames exceed `most_bytes` stays on the disk; see `StoredFrames`.
+        A large observation stays on the disk; see `frames_of`.
 
         Raises:
             StoreError: the store does not hold one of the observations.

@@ -261,11 +261,11 @@ class MujocoSimulator(Simulator):
 
 
 def _require_extent(view: View, name: str) -> None:
-    """Raise ConfigError where the view crops to no box of a scene's size, so that a grid would hold it in a few cells."""
+    """Raise ConfigError where the view crops to no box of a scene's size: a grid would hold all in a few cells."""
     longest = max(high - low for low, high in zip(*view.extent, strict=True))
     if longest > _MOST_METRES:
         raise ConfigError(
-            f"{name} has no voxel_grid: its clouds are cropped to a box of {longest:g} m; use obs_preset 'manicm_ms'"
+            f"{name} has no voxel_grid: its clouds are cropped to a box of {longest:.4g} m; use obs_preset 'manicm_ms'"
         )
 
 

@@ -17,8 +17,8 @@ from manicm_ms.envs.lighting import Lamp, relight, tint
 from manicm_ms.envs.simulator import SimulatorConfig
 from manicm_ms.envs.ur3e_tabletop import UR3eTabletopEnv
 from manicm_ms.sensing.camera import CameraModel
-from manicm_ms.sensing.depth_cloud import nearest_pixels
 from manicm_ms.sensing.cropped import CROPPED, CroppedPoints, observe_cropped
+from manicm_ms.sensing.depth_cloud import nearest_pixels
 from manicm_ms.sensing.point_cloud import crop_transformed, inside, transform
 from manicm_ms.sensing.realism import RealismRows, believed_poses, true_cameras
 from manicm_ms.spec import DEPTH, IMAGE, ObsSpec
@@ -80,7 +80,7 @@ class IdealView(View):
         return frame
 
     def _points(self, position: Tensor, color: Tensor | None) -> CroppedPoints:
-        """Return the points in the workspace, of camera-space positions (n, H, W, 4) int32 and rgba (n, H, W, 4) uint8."""
+        """Return what of camera-space positions (n, H, W, 4) int32, with rgba (n, H, W, 4) uint8, lies in the workspace."""
         if self._T_base_camera is None:
             T_world_camera = self._env._sensors["d435i"].camera.get_model_matrix()
             T_base_world = self._env.agent.robot.pose.inv().to_transformation_matrix()

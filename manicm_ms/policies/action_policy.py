@@ -229,7 +229,7 @@ def read_parts(config: Nested) -> Parts:
 
 
 def keys_read(config: Nested, spec: EnvSpec) -> tuple[str, ...]:
-    """Return the observations that a policy of this configuration reads, without building it; see `ActionPolicy.keys`."""
+    """Return the observations that a policy of this configuration reads (`ActionPolicy.keys`) without building it."""
     parts = read_parts(config)
     transforms = {key: kind(fields, spec) for key, (kind, fields) in parts.inputs.items()}
     return _keys(parts.encoder[0].keys, _effective(transforms, parts.encoder[0].keys))
@@ -270,7 +270,7 @@ def _built(name: str, parts: Parts, spec: EnvSpec, chunk: ChunkSpec) -> ActionPo
 
 
 def _effective(transforms: Mapping[str, InputTransform], keys: Sequence[str]) -> dict[str, InputTransform]:
-    """Return the transforms that change something that an encoder of `keys` reads, or say nothing of what they change."""
+    """Return the transforms that change what an encoder of `keys` reads, or do not say what they change."""
     return {name: t for name, t in transforms.items() if not t.changes or set(t.changes) & set(keys)}
 
 

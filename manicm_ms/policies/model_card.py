@@ -15,7 +15,8 @@ _LONG_LIST = 12  # numbers; longer lists are shown by their range
 _CHANNELS = {3: "x, y, z", 6: "x, y, z, r, g, b"}
 _SEEN: Mapping[str, tuple[str, Callable[[EnvSpec], str]]] = {
     POINT_CLOUD: (
-        "point clouds", lambda spec: f"clouds of {_CHANNELS[spec.obs.point_channels]} (metres, frame `{spec.obs.frame}`)"
+        "point clouds",
+        lambda spec: f"clouds of {_CHANNELS[spec.obs.point_channels]} (metres, frame `{spec.obs.frame}`)"
     ),
     AGENT_POS: ("proprioception", lambda spec: f"agent_pos of {spec.obs.agent_pos_dim}"),
     IMAGE: ("images", lambda spec: f"images of {_sides(spec.obs.image_size)} pixels"),

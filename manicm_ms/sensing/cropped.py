@@ -1,7 +1,7 @@
 """What is observed of the points within a task's crop box, before any of them is chosen: the cloud, the voxel grid.
 
-A simulator, a recording and a real cell all end at the same `CroppedPoints`; each observation that is made of them is one
-function here, so that collection, evaluation and every backend give the same.
+A simulator, a recording and a real cell all end at the same `CroppedPoints`; each observation that is made of them is
+one function here, so that collection, evaluation and every backend give the same.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""Windows of any observation: slices of the stored arrays, the same from memory as from the disk and from two stores."""
+"""Windows of any observation: slices of the stored arrays, the same from memory, from the disk and from two stores."""
 
 import numpy as np
 import pytest
@@ -59,5 +59,8 @@ def test_two_stores_follow_each_other(store, tmp_path, most):
 
 
 def test_an_observation_that_is_not_stored_is_named(tmp_path):
-    with DemoStore.open(make_store(tmp_path / "a.zarr", (3,))) as store, pytest.raises(StoreError, match="no voxel_gri"):
+    with (
+        DemoStore.open(make_store(tmp_path / "a.zarr", (3,))) as store,
+        pytest.raises(StoreError, match="no voxel_gri"),
+    ):
         SequenceDataset.from_store(store, CHUNK, ("voxel_grid",))

@@ -1,6 +1,7 @@
 """The image encoder: the published number of weights, torchvision's ResNet-18, a soft-max written out."""
 
 import math
+from dataclasses import replace
 
 import pytest
 import torch
@@ -66,6 +67,9 @@ def test_the_spatial_softmax_equals_its_sums_written_out():
         assert place == pytest.approx(expected, abs=1e-5)
 
 
-def test_a_width_without_groups_is_refused():
+def test_unfit_sizes_are_refused():
+    small = replace(make_spec(), obs=replace(make_spec().obs, image_size=(84, 40)))
+    with pytest.raises(ConfigError, match="images of 84 x 40 pixels leave the spatial soft-max a single place"):
+        ImageEncoder(ImageEncoderConfig(), small, CHUNK)
     with pytest.raises(ConfigError, match="multiple of 16, got 24"):
         ImageEncoderConfig(width=24)

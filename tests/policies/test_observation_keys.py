@@ -19,7 +19,7 @@ KEYS = {"dp": ("image", "agent_pos"), "voxel_dp": ("voxel_grid", "agent_pos")}
 
 def spec(**obs):
     plain = make_spec(agent_pos=5)
-    return replace(plain, obs=replace(plain.obs, **{"image_size": (20, 24), "voxel_size": 8, **obs}))
+    return replace(plain, obs=replace(plain.obs, **{"image_size": (48, 52), "voxel_size": 8, **obs}))
 
 
 @pytest.fixture(scope="module", params=KEYS)
@@ -66,7 +66,7 @@ def test_a_checkpoint_decides_as_before_and_asks_for_the_same_sizes(policy, tmp_
         assert loaded.spec == made.spec
         assert loaded.keys == made.keys
     card = (tmp_path / policy.name / "MODEL_CARD.md").read_text()
-    assert {"dp": "images of 20 x 24 pixels", "voxel_dp": "voxel grids of 1 x 8 x 8 x 8"}[policy.name] in card
+    assert {"dp": "images of 48 x 52 pixels", "voxel_dp": "voxel grids of 1 x 8 x 8 x 8"}[policy.name] in card
     assert METHODS.get(policy.name).sentence in card
 
 
@@ -93,5 +93,5 @@ def test_the_usual_grid_leaves_no_trace_in_what_is_written_down():
 def test_an_environment_is_asked_for_the_sizes_of_what_is_read_alone():
     obs = spec(voxel_size=64).obs
     assert obs.request(("point_cloud", "agent_pos")) == {"num_points": 32, "colors": False}
-    assert obs.request(("image",)) == {"num_points": 32, "colors": False, "image_size": (20, 24)}
+    assert obs.request(("image",)) == {"num_points": 32, "colors": False, "image_size": (48, 52)}
     assert obs.request(("voxel_grid",)) == {"num_points": 32, "colors": False, "voxel_size": 64}

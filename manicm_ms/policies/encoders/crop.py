@@ -14,7 +14,7 @@ from manicm_ms.spec import IMAGE, VOXEL_GRID, EnvSpec
 
 
 def centre_crop(frames: Tensor, axes: tuple[int, ...], share: float) -> Tensor:
-    """Return the middle of frames (N, ...), `share` of each side of `axes`; an odd rest is split as torchvision does."""
+    """Return the middle of frames (N, ...), `share` of each side of `axes`; odd rests are split as by torchvision."""
     for axis in axes:
         size = frames.shape[axis]
         kept = kept_side(size, share)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import ClassVar
@@ -17,6 +18,8 @@ from manicm_ms.spec import AGENT_POS, IMAGE, ChunkSpec, EnvSpec
 
 _GROUP = 16
 """Channels of a group of GroupNorm."""
+_LEAST = 48
+"""Pixels: a map of the trunk has a 32nd of the cropped side, and should have more than one place."""
 
 
 def _norm(channels: int) -> nn.GroupNorm:
@@ -67,7 +70,7 @@ class ResNet18(nn.Module):
         self.stages = nn.Sequential(
             *(
                 nn.Sequential(BasicBlock(before, after, 1 if k == 0 else 2), BasicBlock(after, after, 1))
-                for k, (before, after) in enumerate(zip(channels, channels[1:], strict=False))
+                for k, (before, after) in enumerate(itertools.pairwise(channels))
             )
         )
 
@@ -129,6 +132,9 @@ class ImageEncoder(ObsEncoder):
         config: sizes.
         spec: the environment that it is made for.
         chunk: To, Tp, Ta.
+
+    Raises:
+        ConfigError: the images are too small.
     """
 
     Config = ImageEncoderConfig
@@ -138,6 +144,12 @@ class ImageEncoder(ObsEncoder):
 
     def __init__(self, config: ImageEncoderConfig, spec: EnvSpec, chunk: ChunkSpec) -> None:
         super().__init__(config, spec, chunk)
+        if min(spec.obs.image_size) < _LEAST:
+            height, width = spec.obs.image_size
+            raise ConfigError(
+                f"images of {height} x {width} pixels leave the spatial soft-max a single place: render at least "
+                f"{_LEAST} x {_LEAST}"
+            )
         self.trunk = ResNet18(config.width)
         self.places = SpatialSoftmax(8 * config.width, config.keypoints)
         self.output = nn.Linear(2 * config.keypoints, config.features)

@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import ClassVar
+from typing import ClassVar, NamedTuple
 
 from torch import Tensor, nn
-from torch.nn.functional import adaptive_max_pool3d, max_pool3d, relu
+from torch.nn.functional import adaptive_max_pool3d, max_pool3d, pad, relu
 
 from manicm_ms.errors import ConfigError, require_at_least
 from manicm_ms.policies.encoders.encoder import ENCODERS, Features, FeatureShape, ObsEncoder
@@ -15,12 +16,29 @@ from manicm_ms.policies.encoders.state import frame_features, state_mlp
 from manicm_ms.spec import AGENT_POS, VOXEL_GRID, ChunkSpec, EnvSpec
 
 _DIVISOR = 16
-_WIDTHS = (1, 2, 2, 4, 4, 8, 8, 16)
-"""Channels after each convolution, in sixteenths of the features."""
-_POOLED_TO = {0: 6, 2: 6, 4: 6, 6: 3}
-"""Convolution that a max-pool follows -> side, cells, below which it does not go; the last one ends there."""
-_NARROW = (0, 3, 7)
-"""Convolutions without padding."""
+
+
+class _Layer(NamedTuple):
+    """A convolution of the published sequence.
+
+    Attributes:
+        width: its channels, in sixteenths of the features.
+        narrow: it has no padding, where enough cells are left without.
+        pooled: a max-pool follows.
+    """
+
+    width: int
+    narrow: bool = False
+    pooled: bool = False
+
+
+_LAYERS = (
+    _Layer(1, narrow=True, pooled=True), _Layer(2), _Layer(2, pooled=True), _Layer(4, narrow=True),
+    _Layer(4, pooled=True), _Layer(8), _Layer(8, pooled=True),
+)  # fmt: skip
+"""All but the last one, which spans the cells that the last pool leaves."""
+_FEWEST, _LAST = 6, 3
+"""Cells along a side that the pools before the last one leave at least, and that the last one leaves."""
 _LEAST = 6
 """Cells along a side of the smallest grid that is taken."""
 
@@ -28,10 +46,10 @@ _LEAST = 6
 class VoxelNet(nn.Module):
     """Eight 3D convolutions (kernel 3, ReLU) with four max-pools between them; grids of any size to a vector.
 
-    The voxel baseline of Wang et al. 2024, Equivariant Diffusion Policy, without the equivariance. On a grid of 58^3 the
-    sides are 58, 56, 28, 14, 12, 6, 3, 1 as published. On smaller grids a pool that would leave less than 6 cells
-    is left out, and a convolution that would is padded, so that the last stages see as many cells as there; what is
-    left over is pooled to 3^3.
+    The voxel baseline of Wang et al. 2024, Equivariant Diffusion Policy, without the equivariance. On a grid of 58^3
+    the sides are 58, 56, 28, 14, 12, 6, 3, 1 as published. On smaller grids a pool that would leave less than 6
+    cells leaves 6, and a convolution is padded that would bring a pool there, so that the last stages see as many cells
+    as in the published size: 29, 27, 13, 6, 6, 6, 3, 1. What is left in the end is pooled to 3^3.
 
     Args:
         channels: of a grid, 1 or 4.
@@ -40,27 +58,27 @@ class VoxelNet(nn.Module):
 
     def __init__(self, channels: int, features: int) -> None:
         super().__init__()
-        widths = [channels, *(features * w // _DIVISOR for w in _WIDTHS)]
-        self.convolutions = nn.ModuleList(nn.Conv3d(a, b, 3) for a, b in zip(widths, widths[1:], strict=False))
+        widths = [channels, *(features * layer.width // _DIVISOR for layer in _LAYERS), features]
+        self.convolutions = nn.ModuleList(nn.Conv3d(a, b, 3) for a, b in itertools.pairwise(widths))
 
     def forward(self, grid: Tensor) -> Tensor:
         """Return (N, n) of grids (N, C, V, V, V) in [0, 1]."""
-        for number, convolution in enumerate(self.convolutions):
-            narrow = number in _NARROW and (number != 3 or grid.shape[-1] - 2 >= 2 * _POOLED_TO[4])
-            padding = 0 if narrow else 1
-            grid = relu(nn.functional.conv3d(grid, convolution.weight, convolution.bias, padding=padding))
-            if number in _POOLED_TO:
-                grid = _pooled(grid, _POOLED_TO[number], exactly=number == 6)
-        return grid.flatten(1)
+        last_pool = max(k for k, layer in enumerate(_LAYERS) if layer.pooled)
+        for number, (layer, convolution) in enumerate(zip(_LAYERS, self.convolutions, strict=False)):
+            if not (layer.narrow and grid.shape[-1] - 2 >= 2 * _FEWEST):
+                grid = pad(grid, (1,) * 6)
+            grid = relu(convolution(grid))
+            if layer.pooled:
+                side = grid.shape[-1]
+                grid = _pooled(grid, _LAST if number == last_pool else min(side, max(_FEWEST, side // 2)))
+        return relu(self.convolutions[-1](grid)).flatten(1)
 
 
-def _pooled(grid: Tensor, least: int, exactly: bool) -> Tensor:
-    """Return a grid of half the side, or of `least` cells where that is more; `exactly` as many in any case."""
-    side = grid.shape[-1]
-    wanted = least if exactly else max(least, side // 2)
-    if wanted == side // 2:
-        return max_pool3d(grid, 2)
-    return grid if wanted >= side and not exactly else adaptive_max_pool3d(grid, wanted)
+def _pooled(grid: Tensor, side: int) -> Tensor:
+    """Return the largest values of (N, C, V, V, V) in as many regions along each axis as `side` says."""
+    if grid.shape[-1] == side:
+        return grid
+    return max_pool3d(grid, 2) if grid.shape[-1] // 2 == side else adaptive_max_pool3d(grid, side)
 
 
 @dataclass(frozen=True)
