@@ -80,7 +80,7 @@ class IdealView(View):
         return frame
 
     def _points(self, position: Tensor, color: Tensor | None) -> CroppedPoints:
-        """Return what of camera-space positions (n, H, W, 4) int32, with rgba (n, H, W, 4) uint8, lies in the workspace."""
+        """Return what of camera-space positions (n, H, W, 4) int32 with rgba (n, H, W, 4) uint8 is in the workspace."""
         if self._T_base_camera is None:
             T_world_camera = self._env._sensors["d435i"].camera.get_model_matrix()
             T_base_world = self._env.agent.robot.pose.inv().to_transformation_matrix()

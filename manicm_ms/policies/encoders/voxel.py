@@ -78,7 +78,7 @@ def _pooled(grid: Tensor, side: int) -> Tensor:
     """Return the largest values of (N, C, V, V, V) in as many regions along each axis as `side` says."""
     if grid.shape[-1] == side:
         return grid
-    return max_pool3d(grid, 2) if grid.shape[-1] // 2 == side else adaptive_max_pool3d(grid, side)
+    return max_pool3d(grid, 2) if grid.shape[-1] == 2 * side else adaptive_max_pool3d(grid, side)
 
 
 @dataclass(frozen=True)
