@@ -144,12 +144,12 @@ class CollectJob(Job):
     def _extras(self, path: Path) -> dict[str, Any]:
         """Return what `collect` is asked for so that the methods find what they read; a store may hold more."""
         needed = self.plan.extras(EnvRequest(self.env_id).entry.spec)
-        if path.exists():
-            with DemoStore.open(path) as store:
-                has = tuple(field for field in OPTIONAL_FIELDS if field in store.fields)
-                if set(needed) <= set(has):
-                    return {"extras": has, "voxel_size": store.spec.obs.voxel_size}
-        return {"extras": needed}
+        if not path.is_dir() or not any(path.iterdir()):
+            return {"extras": needed}
+        with DemoStore.open(path) as store:
+            has = tuple(field for field in OPTIONAL_FIELDS if field in store.fields)
+            size = {"voxel_size": store.spec.obs.voxel_size} if "voxel_grid" in has else {}
+        return {"extras": has, **size} if set(needed) <= set(has) else {"extras": needed}
 
 
 @dataclass(frozen=True)
