@@ -6,7 +6,7 @@ compared before work starts instead of being trusted.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from dataclasses import asdict, dataclass, field
 from typing import Any, NamedTuple
 
@@ -20,12 +20,15 @@ IMAGE = "image"
 """(H, W, 3) uint8."""
 DEPTH = "depth"
 """(H, W) float32, metres along the optical axis, 0 where nothing was hit."""
+VOXEL_GRID = "voxel_grid"
+"""(C, V, V, V) uint8: the task's crop box cut into V cells along x, y and z of `ObsSpec.frame`. Channel 0 is 255 where
+a cell holds a point and 0 elsewhere; with coloured clouds C is 4, and the mean r, g, b of a cell's points follow."""
 STATE = "state"
 """(S,) float32 privileged state, for experts and critics; `EnvSpec.state_layout` names its parts."""
 ACTION = "action"
 """(Da,) float32, normalised to [-1, 1]."""
 
-OBS_KEYS = (POINT_CLOUD, AGENT_POS, IMAGE, DEPTH, STATE)
+OBS_KEYS = (POINT_CLOUD, AGENT_POS, IMAGE, DEPTH, STATE, VOXEL_GRID)
 
 WORLD_FRAME = "world"
 DP3_FRAME = "dp3"
@@ -72,6 +75,10 @@ class ChunkSpec:
         return slice(self.n_obs_steps - 1, self.n_obs_steps - 1 + self.n_action_steps)
 
 
+VOXEL_SIZE = 32
+"""Cells along a side of a voxel grid where nothing is said: 64 is the published number, and 8 times the work."""
+
+
 @dataclass(frozen=True)
 class ObsSpec:
     """What one frame of observation holds.
@@ -82,6 +89,7 @@ class ObsSpec:
         agent_pos_dim: D.
         frame: frame of the cloud, one of `FRAMES`.
         image_size: (H, W) of `image` and `depth`, pixels.
+        voxel_size: V, cells along each side of `voxel_grid`.
     """
 
     num_points: int
@@ -89,12 +97,27 @@ class ObsSpec:
     agent_pos_dim: int
     frame: str
     image_size: tuple[int, int] = (84, 84)
+    voxel_size: int = VOXEL_SIZE
 
     def __post_init__(self) -> None:
         if self.frame not in FRAMES:
             raise ConfigError(f"frame {self.frame!r} is not one of {', '.join(FRAMES)}")
         if self.point_channels not in (3, 6):
             raise ConfigError(f"point_channels must be 3 (xyz) or 6 (xyz, rgb), got {self.point_channels}")
+        require_at_least(1, voxel_size=self.voxel_size)
+
+    def request(self, keys: Collection[str]) -> dict[str, Any]:
+        """Return what `make_vec` is asked for so that the observations `keys` have these forms: name -> value.
+
+        The size of a picture or a grid is left out where none is read: clouds may be rendered at the picture's size,
+        and are made as ever.
+        """
+        asked: dict[str, Any] = {"num_points": self.num_points, "colors": self.point_channels == 6}
+        if IMAGE in keys or DEPTH in keys:
+            asked["image_size"] = self.image_size
+        if VOXEL_GRID in keys:
+            asked["voxel_size"] = self.voxel_size
+        return asked
 
 
 @dataclass(frozen=True)
@@ -128,11 +151,16 @@ class FieldSpec(NamedTuple):
         shape: of a frame; `ANY` for an axis whose length is not fixed.
         unit: of its values.
         frame: frame of reference, one of `FRAMES`, or "" where it has none.
+        dtype: of its values.
+        by_range: whether a policy maps each channel (the last axis) from its range in the demonstrations to [-1, 1];
+            else the values have a fixed meaning, and the encoder that reads them scales them itself.
     """
 
     shape: tuple[int, ...]
     unit: str
     frame: str = ""
+    dtype: str = "float32"
+    by_range: bool = True
 
 
 @dataclass(frozen=True)
@@ -178,17 +206,28 @@ class EnvSpec:
         fields = {
             POINT_CLOUD: FieldSpec((ANY, self.obs.point_channels), "m", self.obs.frame),
             AGENT_POS: FieldSpec((self.obs.agent_pos_dim,), "as named"),
-            IMAGE: FieldSpec((*self.obs.image_size, 3), "0 to 255"),
-            DEPTH: FieldSpec(self.obs.image_size, "m"),
+            IMAGE: FieldSpec((*self.obs.image_size, 3), "0 to 255", dtype="uint8", by_range=False),
+            DEPTH: FieldSpec(self.obs.image_size, "m", by_range=False),
             STATE: FieldSpec((self.state_dim,), "as named"),
-        }
+            VOXEL_GRID: FieldSpec(
+                (4 if self.obs.point_channels == 6 else 1, *(self.obs.voxel_size,) * 3),
+                "0 to 255", self.obs.frame, dtype="uint8", by_range=False,
+            ),
+        }  # fmt: skip
         if key not in fields:
             raise UnknownNameError("observation", key, fields)
         return fields[key]
 
     def to_dict(self) -> dict[str, Any]:
-        """Return plain JSON values; `from_dict` is its inverse."""
-        return asdict(self)
+        """Return plain JSON values; `from_dict` is its inverse.
+
+        The size of voxel grids came later and is left out where it is the usual one: what was written down before, and
+        identifies stores and runs, stays as it was.
+        """
+        values = asdict(self)
+        if self.obs.voxel_size == VOXEL_SIZE:
+            del values["obs"]["voxel_size"]
+        return values
 
     @classmethod
     def from_dict(cls, d: Mapping[str, Any]) -> EnvSpec:
@@ -222,11 +261,14 @@ def _field(spec: EnvSpec, dotted: str) -> Any:
     return value
 
 
-def require_compatible(producer: EnvSpec, consumer: EnvSpec, producer_name: str, consumer_name: str) -> None:
+def require_compatible(
+    producer: EnvSpec, consumer: EnvSpec, producer_name: str, consumer_name: str, keys: Collection[str] = ()
+) -> None:
     """Raise SpecMismatchError unless data of `producer` means what `consumer` was made for.
 
     The env ids may differ (a policy may be tried on a sibling task); shapes, names, frames, the
     control mode and the rate may not. The number of points may differ: encoders pool over points.
+    Of pictures and grids only those that are read, `keys`, must have one size.
     """
     for dotted in _COMPARED:
         ours, theirs = _field(producer, dotted), _field(consumer, dotted)
@@ -234,4 +276,11 @@ def require_compatible(producer: EnvSpec, consumer: EnvSpec, producer_name: str,
             raise SpecMismatchError(
                 f"{producer_name} and {consumer_name} do not fit: {dotted} is {ours!r} in the first and "
                 f"{theirs!r} in the second; use data, checkpoint and environment of one task"
+            )
+    for key in keys:
+        found, wanted = producer.observation(key).shape, consumer.observation(key).shape
+        if found != wanted:
+            raise SpecMismatchError(
+                f"{producer_name} and {consumer_name} do not fit: {key} is {found} in the first and {wanted} in the "
+                "second; use data, checkpoint and environment with frames of one size"
             )

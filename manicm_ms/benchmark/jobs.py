@@ -28,7 +28,7 @@ from rich.console import Console
 from manicm_ms.benchmark.methods import Method, Training
 from manicm_ms.benchmark.plan import Plan
 from manicm_ms.demos.collect import collect
-from manicm_ms.demos.layout import store_path
+from manicm_ms.demos.layout import OPTIONAL_FIELDS, store_path
 from manicm_ms.demos.store import DemoStore
 from manicm_ms.envs.env_request import EnvRequest
 from manicm_ms.errors import ConfigError
@@ -134,12 +134,22 @@ class CollectJob(Job):
         path = store_path(plan.data, self.env_id)
         done = collect(
             self.env_id, plan.demos, path, num_envs=plan.num_envs, seed=plan.demo_seed, colors=plan.colors,
-            obs_preset=plan.obs_preset, console=console,
+            obs_preset=plan.obs_preset, console=console, **self._extras(path),
         )  # fmt: skip
         with DemoStore.open(path) as store:
             _require_demos(store, plan)
             plan.require_unseen(store.seeds.tolist())
             return {"attempts": done.attempts, "episodes": done.episodes, "mean_length": float(store.lengths.mean())}
+
+    def _extras(self, path: Path) -> dict[str, Any]:
+        """Return what `collect` is asked for so that the methods find what they read; a store may hold more."""
+        needed = self.plan.extras(EnvRequest(self.env_id).entry.spec)
+        if not path.is_dir() or not any(path.iterdir()):
+            return {"extras": needed}
+        with DemoStore.open(path) as store:
+            has = tuple(field for field in OPTIONAL_FIELDS if field in store.fields)
+            size = {"voxel_size": store.spec.obs.voxel_size} if "voxel_grid" in has else {}
+        return {"extras": has, **size} if set(needed) <= set(has) else {"extras": needed}
 
 
 @dataclass(frozen=True)

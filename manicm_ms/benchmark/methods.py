@@ -16,11 +16,12 @@ from manicm_ms.errors import ConfigError, UnknownNameError
 from manicm_ms.policies.configuration import parse_overrides
 from manicm_ms.policies.methods import METHODS, STUDENT, head_with_nfe, methods_of
 from manicm_ms.training.optim import FitConfig
-from manicm_ms.training.presets import STUDENT_PRESETS, StudentPreset, TeacherPreset, preset_for
+from manicm_ms.training.presets import CHUNK, STUDENT_PRESETS, StudentPreset, TeacherPreset, preset_for
 
 if TYPE_CHECKING:
     from manicm_ms.policies.action_policy import ActionPolicy
     from manicm_ms.policies.policy import Policy
+    from manicm_ms.spec import EnvSpec
 
 DEFAULT_TEACHER = "simple_dp3"
 
@@ -84,6 +85,10 @@ class Method(ABC):
         """
         return None
 
+    def reads(self, preset: str, spec: EnvSpec) -> tuple[str, ...]:
+        """Return the observations that demonstrations must hold for it: a student's are its teacher's."""
+        return () if self.made_from is None else self.made_from.reads(preset, spec)
+
     @abstractmethod
     def train(self, out: Path, source: Path | None, training: Training) -> None:
         """Write the checkpoint `out`; `source` is that of `made_from`."""
@@ -113,6 +118,13 @@ class Trained(Method):
         changed = preset_for(self.row, size).with_changes(parse_overrides(read_name(self.name).overrides))
         changed.configuration(self.row)
         return changed
+
+    def reads(self, preset: str, spec: EnvSpec) -> tuple[str, ...]:
+        """See `Method.reads`."""
+        from manicm_ms.policies.action_policy import keys_read
+
+        config = self.preset(preset).configuration(self.row)
+        return keys_read({key: value for key, value in config.items() if key != CHUNK}, spec)
 
     def train(self, out: Path, source: Path | None, training: Training) -> None:
         """See `Method.train`."""

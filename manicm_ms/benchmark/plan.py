@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from manicm_ms.benchmark.methods import DEFAULT_TEACHER, Method, parse_methods
+from manicm_ms.demos.layout import OBS_OF_FIELD, OPTIONAL_FIELDS
 from manicm_ms.errors import ConfigError
 from manicm_ms.seeds import require_seed
 from manicm_ms.training.presets import STUDENT_PRESETS, TEACHER_PRESETS
@@ -17,6 +18,7 @@ from manicm_ms.training.settings import preset_identity
 
 if TYPE_CHECKING:
     from manicm_ms.envs.simulator import EnvEntry
+    from manicm_ms.spec import EnvSpec
 
 EVALUATION_SEEDS_BEYOND = 1_000_000
 """The evaluations during training play seeds this far beyond the first fresh one."""
@@ -123,6 +125,11 @@ class Plan:
         """Return the seeds of evaluation `number` during training, counted from 0; no two evaluations share one."""
         first = self.eval_seed + EVALUATION_SEEDS_BEYOND + number * self.evaluation_episodes
         return range(first, first + self.evaluation_episodes)
+
+    def extras(self, spec: EnvSpec) -> tuple[str, ...]:
+        """Return the optional fields of demonstrations that the methods learn from in the environment of `spec`."""
+        read = {key for method in self.parsed_methods for key in method.reads(self.preset, spec)}
+        return tuple(field for field in OPTIONAL_FIELDS if OBS_OF_FIELD[field] in read)
 
     def folder(self, env_id: str, seed: int | None = None, method: Method | None = None) -> Path:
         """Return where what belongs to a task, one of its seeds, or one method with that seed lies."""

@@ -10,6 +10,7 @@ import tyro
 from manicm_ms.cli.counts import AtLeast, Count, OptionalCount, Seed
 from manicm_ms.cli.options import Backend
 from manicm_ms.errors import ConfigError
+from manicm_ms.spec import VOXEL_SIZE
 
 
 def collect_command(
@@ -23,6 +24,7 @@ def collect_command(
     backend: Backend = "auto",
     colors: bool = False,
     extras: tuple[str, ...] = (),
+    voxel_size: Count = VOXEL_SIZE,
     tail_steps: Annotated[int | None, AtLeast(0)] = None,
     realism: str = "clean",
     camera: Path | None = None,
@@ -40,7 +42,8 @@ def collect_command(
         style: style of the expert, its default one if not given.
         backend: where to simulate.
         colors: store rgb beside xyz.
-        extras: optional fields to store: image, depth, privileged_state.
+        extras: optional fields to store: image, depth, privileged_state, voxel_grid.
+        voxel_size: cells along each side of a voxel grid; 64 is the published number.
         tail_steps: control steps kept after the first success; by default the task's own number.
         realism: clean, d435i or d435i+dr: camera errors and physical values drawn for each episode.
         camera: YAML file of the cell's depth camera, as 'manicm-ms calibrate' writes it.
@@ -51,8 +54,8 @@ def collect_command(
 
     options = {
         "num_envs": num_envs or default_num_envs(), "seed": seed, "style": style, "backend": backend,
-        "colors": colors, "extras": extras, "tail_steps": tail_steps, "realism": realism, "camera": camera,
-        "obs_preset": obs_preset,
+        "colors": colors, "extras": extras, "voxel_size": voxel_size, "tail_steps": tail_steps, "realism": realism,
+        "camera": camera, "obs_preset": obs_preset,
     }  # fmt: skip
     if (env_id is None) == (tag is None):
         raise ConfigError("name one environment id, or --tag and a tag ('manicm-ms list envs' shows both)")

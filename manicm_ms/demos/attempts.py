@@ -13,21 +13,12 @@ import numpy as np
 import torch
 
 from manicm_ms.demos.experts import Expert
-from manicm_ms.demos.layout import Episode
+from manicm_ms.demos.layout import OBS_OF_FIELD, Episode
 from manicm_ms.envs.simulator import DemoRule
 from manicm_ms.envs.vector import VecEnv
 from manicm_ms.errors import ConfigError
 from manicm_ms.sensing.realism import RealismSample
-from manicm_ms.spec import ACTION, AGENT_POS, DEPTH, IMAGE, POINT_CLOUD, STATE
-
-OBS_OF_FIELD = {
-    "point_cloud": POINT_CLOUD,
-    "agent_pos": AGENT_POS,
-    "image": IMAGE,
-    "depth": DEPTH,
-    "privileged_state": STATE,
-}
-"""Field of `Episode` -> observation key that it is recorded from."""
+from manicm_ms.spec import ACTION, STATE
 
 
 @dataclass(frozen=True)

@@ -29,7 +29,7 @@ from manicm_ms.paths import require_free_space
 from manicm_ms.progress import progress_bars
 from manicm_ms.provenance import package_versions
 from manicm_ms.sensing.realism import Realism
-from manicm_ms.spec import EnvSpec
+from manicm_ms.spec import VOXEL_SIZE, EnvSpec
 
 # Beyond these failures an expert is broken, not unlucky.
 _FAILURES_PER_EPISODE, _FAILURES_FREE = 10, 50
@@ -63,6 +63,7 @@ def collect(
     backend: str = "auto",
     colors: bool = False,
     extras: Iterable[str] = (),
+    voxel_size: int = VOXEL_SIZE,
     tail_steps: int | None = None,
     realism: str | Realism = "clean",
     camera: Path | None = None,
@@ -84,6 +85,7 @@ def collect(
         backend: "cpu", "gpu" or "auto", as in `make_vec`.
         colors: store rgb beside xyz.
         extras: optional fields of `Episode` to store, from `OPTIONAL_FIELDS`.
+        voxel_size: cells along each side of voxel grids, where `extras` names them.
         tail_steps: control steps kept after the first success where the task goes on after it; None: the task's own.
         realism: preset or ranges, as in `make_vec`; what it draws is stored with every episode.
         camera: YAML file of the cell's depth camera, as in `make_vec`.
@@ -94,7 +96,7 @@ def collect(
     UnknownNameError for the id, the style or the preset, ManicmError where the expert fails far too often.
     """
     env_asked = EnvRequest(env_id, backend, colors=colors, realism=realism, camera=camera, obs_preset=obs_preset)
-    plan = CollectionPlan(env_asked, num_envs, seed, style, tuple(extras), tail_steps)
+    plan = CollectionPlan(env_asked, num_envs, seed, style, tuple(extras), tail_steps, voxel_size)
     _require_some(episodes)
     out = Path(out)
     if out.is_file():
@@ -130,6 +132,7 @@ def collect_episodes(
     backend: str = "auto",
     colors: bool = False,
     extras: Iterable[str] = (),
+    voxel_size: int = VOXEL_SIZE,
     tail_steps: int | None = None,
     realism: str | Realism = "clean",
     camera: Path | None = None,
@@ -140,7 +143,7 @@ def collect_episodes(
     Raises ConfigError, UnknownNameError, ManicmError as `collect`. An interruption loses them: for many, use `collect`.
     """
     env_asked = EnvRequest(env_id, backend, colors=colors, realism=realism, camera=camera, obs_preset=obs_preset)
-    plan = CollectionPlan(env_asked, num_envs, seed, style, tuple(extras), tail_steps)
+    plan = CollectionPlan(env_asked, num_envs, seed, style, tuple(extras), tail_steps, voxel_size)
     _require_some(episodes)
     kept: list[Episode] = []
     with plan.collector() as collector, _progress_bar(env_id, episodes, 0) as report:

@@ -8,15 +8,15 @@ from dataclasses import dataclass, replace
 from functools import partial
 from typing import Any
 
-from manicm_ms.demos.attempts import OBS_OF_FIELD, Collector
+from manicm_ms.demos.attempts import Collector
 from manicm_ms.demos.experts import EXPERTS
-from manicm_ms.demos.layout import OPTIONAL_FIELDS
+from manicm_ms.demos.layout import OBS_OF_FIELD, OPTIONAL_FIELDS
 from manicm_ms.envs.env_request import EnvRequest
 from manicm_ms.envs.simulator import DemoRule
-from manicm_ms.errors import ConfigError
+from manicm_ms.errors import ConfigError, require_at_least
 from manicm_ms.seeds import require_seed
 from manicm_ms.sensing.realism import Realism, realism_name, resolve_realism
-from manicm_ms.spec import ACTION, AGENT_POS, POINT_CLOUD, STATE
+from manicm_ms.spec import ACTION, AGENT_POS, POINT_CLOUD, STATE, VOXEL_GRID, VOXEL_SIZE
 
 
 @dataclass(frozen=True)
@@ -32,11 +32,15 @@ class CollectionPlan:
     style: str | None
     extras: tuple[str, ...]
     tail_steps: int | None
+    voxel_size: int = VOXEL_SIZE
 
     def __post_init__(self) -> None:
         if self.num_envs < 1:
             raise ConfigError(f"num_envs must be at least 1, got {self.num_envs}")
         require_seed(self.seed)
+        require_at_least(1, voxel_size=self.voxel_size)
+        if self.voxel_size != VOXEL_SIZE and VOXEL_GRID not in self.extras:
+            raise ConfigError(f"voxel_size={self.voxel_size} without voxel grids: add {VOXEL_GRID} to the extras")
         if unknown := set(self.extras) - set(OPTIONAL_FIELDS):
             raise ConfigError(f"extras {sorted(unknown)} are not known: choose from {', '.join(OPTIONAL_FIELDS)}")
         _ = self.env.entry  # knows former names too
@@ -66,13 +70,14 @@ class CollectionPlan:
             "realism": realism_name(self.realism),
             "realism_ranges": None if self.realism.is_clean else self.realism.to_dict(),
             "camera": None if (camera := self.env.camera_model) is None else camera.to_dict(),
+            **({"voxel_size": self.voxel_size} if VOXEL_GRID in self.extras else {}),
         }
 
     @contextmanager
     def collector(self) -> Iterator[Collector]:
         """Make environment and expert; yield what plays, and close the environment after it."""
         keys = dict.fromkeys([POINT_CLOUD, AGENT_POS, STATE, *(OBS_OF_FIELD[f] for f in self.extras)])
-        env = self.env.vec_env(self.num_envs, obs=tuple(keys))
+        env = self.env.vec_env(self.num_envs, obs=tuple(keys), voxel_size=self.voxel_size)
         try:
             expert = EXPERTS.get(self.env.env_id)(env.env_spec, self.num_envs, env.device, self.style)
             conditions = partial(self.env.entry.conditions, self.realism)

@@ -169,6 +169,7 @@ def _facts(found: Summary) -> list[tuple[str, str]]:
         spread = f"{min(lengths)} to {max(lengths)}, median {np.median(lengths):g}"
         rows.append(("lengths", f"{spread} control steps; {found.frames} frames in all"))
     rows.append(("expert", f"{found.expert or 'unknown'}, style {found.style or 'unknown'}"))
+    rows.append(("stored", ", ".join(f"{name} {form}" for name, form in found.fields.items())))
     rows.append(("size", f"{found.bytes_on_disk / 1e6:.1f} MB"))
     if "command" in found.provenance:
         rows.append(("command", str(found.provenance["command"])))

@@ -10,6 +10,7 @@
       data/img                 (F, H, W, 3) uint8, only where asked for
       data/depth               (F, H, W) float32 metres, only where asked for
       data/privileged_state    (F, S) float32, only where asked for
+      data/voxel_grid          (F, C, V, V, V) uint8 over the task's crop box, only where asked for
       meta/episode_ends        (E,) int64, one past the last frame of each episode
       meta/{seed,length}       (E,) int64
       meta/success             (E,) bool
@@ -36,7 +37,7 @@ import zarr
 from manicm_ms.demos.zarr_files import ALL_WRITTEN, EPISODE_ENDS, looks_like_dp3
 from manicm_ms.errors import StoreError
 from manicm_ms.paths import write_json
-from manicm_ms.spec import EnvSpec
+from manicm_ms.spec import ACTION, AGENT_POS, ANY, DEPTH, IMAGE, POINT_CLOUD, STATE, VOXEL_GRID, EnvSpec
 
 FORMAT = "manicm_ms demos 1"
 """Value of the attribute `format`; another number means another layout."""
@@ -48,10 +49,23 @@ FRAME_ARRAYS: Mapping[str, str] = {
     "image": "img",
     "depth": "depth",
     "privileged_state": "privileged_state",
+    "voxel_grid": "voxel_grid",
 }
 """Field of `Episode` -> name of its array under `data/`."""
 
-OPTIONAL_FIELDS = ("image", "depth", "privileged_state")
+OBS_OF_FIELD: Mapping[str, str] = {
+    "point_cloud": POINT_CLOUD,
+    "agent_pos": AGENT_POS,
+    "image": IMAGE,
+    "depth": DEPTH,
+    "privileged_state": STATE,
+    "voxel_grid": VOXEL_GRID,
+}
+"""Field of `Episode` -> observation key that it is recorded from."""
+FIELD_OF_OBS: Mapping[str, str] = {key: field for field, key in OBS_OF_FIELD.items()}
+"""Observation key -> field of `Episode`."""
+
+OPTIONAL_FIELDS = ("image", "depth", "privileged_state", "voxel_grid")
 EPISODE_ARRAYS = {"seed": np.dtype("<i8"), "success": np.dtype("bool"), "length": np.dtype("<i8")}
 """Arrays under `meta/` beside `episode_ends`, with their types."""
 
@@ -62,6 +76,7 @@ STORE_ARRAYS = frozenset(
 """Every array that a store may hold."""
 
 _CHUNK_FRAMES = 100  # about an episode; DP3's stores have the same
+_CHUNK_BYTES = 4 << 20  # of the optional arrays, whose frames may be large: what is read for one frame
 _CHUNK_EPISODES = 1024
 
 
@@ -78,6 +93,7 @@ class Episode:
         image: (L, H, W, 3) uint8, or None.
         depth: (L, H, W) float32 metres, or None.
         privileged_state: (L, S) float32, or None.
+        voxel_grid: (L, C, V, V, V) uint8, or None.
         realism: name -> value of what was drawn for this episode beside the scene; empty where nothing was.
     """
 
@@ -90,6 +106,7 @@ class Episode:
     depth: np.ndarray | None = None
     privileged_state: np.ndarray | None = None
     realism: Mapping[str, float] = dataclasses.field(default_factory=dict)
+    voxel_grid: np.ndarray | None = None
 
     def __len__(self) -> int:
         return len(self.action)
@@ -102,15 +119,15 @@ def store_path(folder: Path, env_id: str) -> Path:
 
 def frame_shapes(spec: EnvSpec) -> dict[str, tuple[tuple[int, ...], np.dtype]]:
     """Return, per field of `Episode`, the shape of one frame and its type."""
-    f32, (h, w) = np.dtype("<f4"), spec.obs.image_size
-    return {
-        "point_cloud": ((spec.obs.num_points, spec.obs.point_channels), f32),
-        "agent_pos": ((spec.obs.agent_pos_dim,), f32),
-        "action": ((spec.action.dim,), f32),
-        "image": ((h, w, 3), np.dtype("u1")),
-        "depth": ((h, w), f32),
-        "privileged_state": ((spec.state_dim,), f32),
-    }
+    shapes: dict[str, tuple[tuple[int, ...], np.dtype]] = {}
+    for field in FRAME_ARRAYS:
+        if field == ACTION:
+            shapes[field] = (spec.action.dim,), np.dtype("<f4")
+            continue
+        seen = spec.observation(OBS_OF_FIELD[field])
+        shape = tuple(spec.obs.num_points if n == ANY else n for n in seen.shape)
+        shapes[field] = shape, np.dtype(seen.dtype).newbyteorder("<")
+    return shapes
 
 
 def checked_frames(field: str, episode: Episode, spec: EnvSpec, path: Path) -> np.ndarray:
@@ -163,8 +180,11 @@ def write_empty(
         if field in OPTIONAL_FIELDS and field not in extras:
             continue
         shape, dtype = shapes[field]
+        frames = chunk_frames
+        if field in OPTIONAL_FIELDS:
+            frames = max(1, min(frames, _CHUNK_BYTES // (int(np.prod(shape)) * dtype.itemsize)))
         data.create_array(
-            name, shape=(0, *shape), chunks=(chunk_frames, *shape), dtype=dtype, compressors=compressor, fill_value=0
+            name, shape=(0, *shape), chunks=(frames, *shape), dtype=dtype, compressors=compressor, fill_value=0
         )
     for name, dtype in EPISODE_ARRAYS.items():
         meta.create_array(name, shape=(0,), chunks=(_CHUNK_EPISODES,), dtype=dtype, compressors=None, fill_value=0)

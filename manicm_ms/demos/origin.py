@@ -11,11 +11,11 @@ from manicm_ms.demos.store import DemoStore
 from manicm_ms.envs.env_request import EnvRequest
 from manicm_ms.envs.simulator import ENVS
 from manicm_ms.errors import StoreError
-from manicm_ms.spec import EnvSpec
+from manicm_ms.spec import VOXEL_SIZE, EnvSpec
 
 IDENTITY = (
     "env_id", "seed", "expert", "style", "tail_steps", "fields", "point_channels", "backend", "realism",
-    "realism_ranges", "camera", "success_steps", "obs_preset",
+    "realism_ranges", "camera", "success_steps", "obs_preset", "voxel_size",
 )  # fmt: skip
 _UNRECORDED: Mapping[str, Any] = {
     "realism": "clean", "realism_ranges": None, "camera": None, "success_steps": 1, "obs_preset": "manicm_ms",
@@ -57,4 +57,6 @@ def collect_command(asked: Mapping[str, Any], episodes: int, extras: tuple[str, 
     words += ["--tail-steps", tail] if tail != ENVS.get(asked["env_id"]).demos.tail_steps else []
     words += env.options()
     words += ["--extras", *extras] if extras else []
+    size = asked.get("voxel_size", VOXEL_SIZE)
+    words += ["--voxel-size", size] if size != VOXEL_SIZE else []
     return shlex.join(str(w) for w in words)

@@ -10,8 +10,9 @@ import re
 from collections.abc import Collection, Iterable, Iterator, Mapping
 
 import numpy as np
+from torch import Tensor
 
-from manicm_ms.demos.layout import OPTIONAL_FIELDS, STORE_ARRAYS
+from manicm_ms.demos.layout import FIELD_OF_OBS, OPTIONAL_FIELDS, STORE_ARRAYS
 from manicm_ms.demos.sequence_dataset import SequenceDataset, sequence_index
 from manicm_ms.demos.store import DemoStore
 from manicm_ms.demos.zarr_files import array_names, remark_missing
@@ -36,6 +37,7 @@ _OUTER_POINTS = (0.05, 99.95)  # per cent of the coordinates of points, which ar
 _STRETCH_POINTS = 5.0
 _FRAMES_LOOKED_AT = 100  # for where the bulk of the points is
 _BLOCK_FRAMES = 512
+_UNREMARKABLE = ("image", "voxel_grid", "privileged_state")  # any value may stand there: they are not even read
 _SMALLEST = 5e-3  # m; no cloud of a scene is smaller
 
 
@@ -51,7 +53,7 @@ def store_remarks(store: DemoStore, frames: Mapping[str, np.ndarray] | None = No
     remarks = [*remark_missing(store.missing_files), *unread_remarks(unread)]
     remarks += length_remarks(store.lengths, store.spec)
     for name in store.fields:
-        if name != "image":
+        if name not in _UNREMARKABLE:
             remarks += field_remarks(name, frames[name] if name in frames else store.frames(name), store.spec)
     return remarks
 
@@ -115,15 +117,16 @@ def training_remarks(store: DemoStore, windows: SequenceDataset) -> list[str]:
 
     Args:
         store: open.
-        windows: those of the store, in the CPU's memory.
+        windows: those of the store, on the CPU.
     """
-    read = {name: getattr(windows, name).numpy() for name in ("point_cloud", "agent_pos", "action")}
+    held = {FIELD_OF_OBS.get(key, key): v for key, v in windows.frames.items()}
+    read = {name: values.numpy() for name, values in held.items() if isinstance(values, Tensor)}
     remarks = [*store_remarks(store, read), *window_remarks(store.lengths, windows.chunk)]
-    if empty := int(empty_clouds(read["point_cloud"]).sum()):
+    if "point_cloud" in read and (empty := int(empty_clouds(read["point_cloud"]).sum())):
         remarks.append(f"{counted(empty, 'frame')} of {len(windows.action)} with an empty cloud: 'inspect' names them")
     if failed := int((~store.successes).sum()):
         remarks.append(f"{counted(failed, 'episode')} of {len(store)} not solved, and learnt from all the same")
-    if idle := [name for name in OPTIONAL_FIELDS if name in store.fields]:
+    if idle := [name for name in OPTIONAL_FIELDS if name in store.fields and name not in held]:
         remarks.append(f"stored but not learnt from: {', '.join(idle)}")
     return remarks
 

@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from manicm_ms.demos.layout import FIELD_OF_OBS
 from manicm_ms.errors import StoreError
 from manicm_ms.spec import ACTION, AGENT_POS, POINT_CLOUD
 
@@ -68,9 +70,10 @@ def field_stats(array: Any, name: str = "array") -> FieldStats:
     return FieldStats(low, high, mean, std)
 
 
-def store_stats(store: DemoStore) -> dict[str, FieldStats]:
-    """Return the statistics of `point_cloud`, `agent_pos` and `action` over all committed frames of `store`."""
-    ends = np.asarray(store.episode_ends)
-    frames = int(ends[-1]) if len(ends) else 0
-    fields = {POINT_CLOUD: store.point_cloud, AGENT_POS: store.state, ACTION: store.action}
-    return {name: field_stats(array[:frames], name) for name, array in fields.items()}
+def store_stats(store: DemoStore, keys: Iterable[str] = (POINT_CLOUD, AGENT_POS)) -> dict[str, FieldStats]:
+    """Return the statistics over all committed frames of `store` of its actions and of those `keys` that need them.
+
+    An observation whose values have a fixed meaning, as pictures and grids, needs none (`FieldSpec.by_range`).
+    """
+    ranged = [key for key in keys if store.spec.observation(key).by_range]
+    return {key: field_stats(store.frames(FIELD_OF_OBS.get(key, key)), key) for key in (*ranged, ACTION)}

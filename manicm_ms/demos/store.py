@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import errno
+import math
 import os
-from collections.abc import Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from contextlib import suppress
 from pathlib import Path
 from types import TracebackType
@@ -19,6 +20,7 @@ from manicm_ms.demos.layout import (
     Episode,
     checked_frames,
     checked_realism,
+    frame_shapes,
     read_attrs,
     write_empty,
 )
@@ -184,11 +186,23 @@ class DemoStore:
 
     def frames(self, field: str, start: int = 0, stop: int | None = None) -> np.ndarray:
         """Return the committed frames [start, stop) of a field of `Episode`; all of them by default."""
+        last = self.num_frames
+        return self._read(field, lambda array: array[start : last if stop is None else min(stop, last)])
+
+    def frames_at(self, field: str, numbers: np.ndarray) -> np.ndarray:
+        """Return the committed frames with these numbers, growing (K,) int64; reads the chunks that they lie in."""
+        return self._read(field, lambda array: array.oindex[numbers])
+
+    def frame_bytes(self, field: str) -> int:
+        """Return the bytes of one frame of a field of `Episode`, in memory."""
+        shape, dtype = frame_shapes(self.spec)[field]
+        return math.prod(shape) * dtype.itemsize
+
+    def _read(self, field: str, take: Callable[[Any], Any]) -> np.ndarray:
         if field not in self.fields:
             raise StoreError(f"{self.path} holds no {field}: it holds {', '.join(self.fields)}")
-        last = self.num_frames
         try:
-            return np.asarray(self._arrays.frames(field)[start : last if stop is None else min(stop, last)])
+            return np.asarray(take(self._arrays.frames(field)))
         except (OSError, RuntimeError, ValueError) as e:  # what the codecs raise on a damaged chunk
             raise StoreError(
                 f"{self.path} is damaged: data/{FRAME_ARRAYS[field]} cannot be read ({e}); "

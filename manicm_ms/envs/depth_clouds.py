@@ -12,7 +12,8 @@ from torch import Tensor
 
 from manicm_ms.envs.cameras import MICROMETRE
 from manicm_ms.sensing.camera import CameraModel
-from manicm_ms.sensing.depth_cloud import CLOUD_SIZE, depth_to_cloud
+from manicm_ms.sensing.cropped import CroppedPoints, clouds_of
+from manicm_ms.sensing.depth_cloud import CLOUD_SIZE, depth_to_points
 from manicm_ms.sensing.point_cloud import Box
 from manicm_ms.sensing.stereo_depth import StereoDepth
 
@@ -30,7 +31,7 @@ class DepthFrame(NamedTuple):
 
 
 class DepthClouds:
-    """Clouds of n rows as a real depth camera would give them; the same `depth_to_cloud` as for its recordings.
+    """Clouds of n rows as a real depth camera would give them; the same points as of its recordings.
 
     A simulator renders the position picture of `camera.crop` at native resolution (`camera.crop_intrinsic`,
     `sapien_pose(camera)`), calls `start` for the rows that it resets and `observe` for a frame::
@@ -107,7 +108,19 @@ class DepthClouds:
         *,
         lit: Tensor | None = None,
     ) -> DepthFrame:
-        """Return depth and clouds of the present pictures.
+        """Return depth and clouds of the present pictures; arguments as those of `observe_points`."""
+        depth, points = self.observe_points(position, steps, color, lit=lit)
+        return DepthFrame(depth, clouds_of(points, self._num_points))
+
+    def observe_points(
+        self,
+        position: Tensor,
+        steps: Sequence[int] | Tensor,
+        color: Tensor | None = None,
+        *,
+        lit: Tensor | None = None,
+    ) -> tuple[Tensor, CroppedPoints]:
+        """Return depth, as in `DepthFrame`, and the points in the workspace that clouds and grids are made of.
 
         Args:
             position: (n, h, w, 4) int32: camera-space x, y, z in micrometres (OpenGL axes: z backward) of the crop at
@@ -130,11 +143,11 @@ class DepthClouds:
         else:
             depth = depth * self._scale[:, None, None]
         painted = rgb if lit is None else lit.to(torch.float32) / 255
-        cloud = depth_to_cloud(
-            depth, self.camera, self.workspace, self._num_points, self._size,
+        points = depth_to_points(
+            depth, self.camera, self.workspace, self._size,
             T_base_camera=self._T_base_camera, rgb=painted if self._colors else None,
         )  # fmt: skip
-        return DepthFrame(depth, cloud)
+        return depth, points
 
 
 def sapien_pose(camera: CameraModel) -> sapien.Pose:

@@ -24,17 +24,17 @@ from manicm_ms.envs.cameras import CLOUD_POSITION, COLOR, cloud_shader, set_clou
 from manicm_ms.envs.delay import ActionDelay  # noqa: E402
 from manicm_ms.envs.simulator import ENVS, Simulator, SimulatorConfig, StepResult  # noqa: E402
 from manicm_ms.envs.ur3e_tabletop import UR3eTabletopEnv  # noqa: E402
-from manicm_ms.envs.views import CameraView, IdealView, View  # noqa: E402
+from manicm_ms.envs.views import CROPPED_KEYS, CameraView, IdealView, View  # noqa: E402
 from manicm_ms.errors import ConfigError  # noqa: E402
 from manicm_ms.robots.ur3e_ag95 import TCP_STEP, opening_to_action  # noqa: E402
 from manicm_ms.sensing.camera import CameraModel, require_view  # noqa: E402
 from manicm_ms.sensing.camera_files import default_camera  # noqa: E402
 from manicm_ms.sensing.point_cloud import Box  # noqa: E402
 from manicm_ms.sensing.realism import RealismRows  # noqa: E402
-from manicm_ms.spec import AGENT_POS, DEPTH, IMAGE, POINT_CLOUD, STATE, EnvSpec  # noqa: E402
+from manicm_ms.spec import AGENT_POS, DEPTH, IMAGE, STATE, EnvSpec  # noqa: E402
 
 VIDEO_SHADER = "default"
-_RENDERED = {POINT_CLOUD, IMAGE, DEPTH}
+_RENDERED = CROPPED_KEYS | {IMAGE, DEPTH}
 _NO_VULKAN = ("failed to find a rendering device", "vk::")
 """How SAPIEN words it when no driver, or no device that can render, is there."""
 
@@ -63,7 +63,9 @@ class ManiSkillSimulator(Simulator):
         self.device = self.env.device
         self._camera = self.env._sensors["d435i"]
         self._view: View = (
-            IdealView(self.env, config) if camera is None else CameraView(self.env, config, camera, self.device)
+            IdealView(self.env, config, spec.obs)
+            if camera is None
+            else CameraView(self.env, config, camera, spec.obs, self.device)
         )
         longest = config.realism.action_delay + config.realism.gripper_delay
         self._delay = ActionDelay(self.num_rows, spec.action.dim, longest, self.device) if longest else None

@@ -12,13 +12,16 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from manicm_ms.envs.mujoco_render import LeanRenderer, Picture, mujoco
-from manicm_ms.envs.mujoco_task import FixedPose, MujocoTask, Outcome
+from manicm_ms.envs.mujoco_task import FixedPose, MujocoTask, Outcome, View
 from manicm_ms.envs.simulator import Simulator, SimulatorConfig, StepResult
 from manicm_ms.errors import BackendError, ConfigError
+from manicm_ms.sensing.cropped import CroppedPoints, clouds_of, observe_cropped
 from manicm_ms.sensing.point_cloud import crop_transformed
-from manicm_ms.spec import AGENT_POS, DEPTH, IMAGE, POINT_CLOUD, STATE, EnvSpec
+from manicm_ms.spec import AGENT_POS, DEPTH, IMAGE, POINT_CLOUD, STATE, VOXEL_GRID, EnvSpec
 
 VIDEO_SIZE = (360, 480)
+_MOST_METRES = 5.0
+"""Side of the largest crop box over which a voxel grid means something."""
 EpisodeState = dict[str, NDArray[Any]]
 """What `save_state` returns: name -> array; plain numbers, fit for npz and zarr."""
 
@@ -94,7 +97,7 @@ class MujocoSimulator(Simulator):
 
     Raises:
         BackendError: more than one row, or another device than the CPU.
-        ConfigError: a reward mode that the suite does not have, realism, or a camera file.
+        ConfigError: a reward mode that the suite does not have, realism, a camera file, or a voxel grid without a box.
     """
 
     def __init__(self, spec: EnvSpec, config: SimulatorConfig, task: MujocoTask, env: SuiteEnv) -> None:
@@ -106,6 +109,8 @@ class MujocoSimulator(Simulator):
         self.spec, self.config, self.num_rows = spec, config, 1
         self.device = torch.device("cpu")
         self.env, self._view = env, task.views[config.obs_preset]
+        if VOXEL_GRID in config.obs:
+            _require_extent(self._view, f"{spec.env_id} with obs_preset {config.obs_preset!r}")
         self._camera = _place_camera(env.model, self._view.camera, self._view.pose)
         if self._view.clip is not None:
             env.model.vis.map.znear, env.model.vis.map.zfar = self._view.clip
@@ -160,19 +165,29 @@ class MujocoSimulator(Simulator):
         if STATE in wanted:
             frame[STATE] = self.env.state().astype(np.float32)
         pictures: dict[tuple[int, int], Picture] = {}
-        if POINT_CLOUD in wanted:
+        cropped: dict[str, Tensor] = {}
+        if POINT_CLOUD in wanted or VOXEL_GRID in wanted:
             pictures[self._cloud_size] = picture = self._shoot(self._cloud_size)
-            frame[POINT_CLOUD] = self._cloud(picture)
+            cropped = self._observe_cropped(self._points(picture))
         if IMAGE in wanted or DEPTH in wanted:
             size = self.config.image_size
             picture = pictures.get(size) or self._shoot(size)
             frame |= {IMAGE: picture.image, DEPTH: np.where(picture.hit, picture.depth, np.float32(0))}
-        return {key: torch.from_numpy(frame[key])[None] for key in wanted}
+        return {key: cropped[key] if key in cropped else torch.from_numpy(frame[key])[None] for key in wanted}
 
     def _shoot(self, size: tuple[int, int]) -> Picture:
         return self._renderer.render(self.env.data, self._camera, size)
 
-    def _cloud(self, picture: Picture) -> NDArray[np.float32]:
+    def _observe_cropped(self, points: NDArray[np.float32]) -> dict[str, Tensor]:
+        """Return what is wanted of the points (K, C) in the workspace; the view says how its cloud is sampled."""
+        cropped, obs = CroppedPoints.of_rows([points]), self.spec.obs
+        frame = observe_cropped(set(self.config.obs) - {POINT_CLOUD}, cropped, self._view.extent, obs)
+        if POINT_CLOUD in self.config.obs:
+            frame[POINT_CLOUD] = clouds_of(cropped, obs.num_points, self._view.sampler)
+        return frame
+
+    def _points(self, picture: Picture) -> NDArray[np.float32]:
+        """Return the points (K, C) of a picture that lie in the workspace."""
         model, data, camera = self.env.model, self.env.data, self._camera
         T_cloud_camera = self._view.frame.from_camera(
             data.cam_xmat[camera].reshape(3, 3), data.cam_xpos[camera], model.cam_mat0[0].reshape(3, 3)
@@ -184,7 +199,7 @@ class MujocoSimulator(Simulator):
         if self.config.colors:
             pixels = hit[np.concatenate([index for index, _ in parts])]
             points = np.concatenate([points, picture.image.reshape(-1, 3)[pixels] / np.float32(255)], axis=1)
-        return self._view.sampler(points, self.config.num_points)
+        return points
 
     def render_video_frames(self) -> Tensor:
         """See `Simulator.render_video_frames`."""
@@ -243,6 +258,15 @@ class MujocoSimulator(Simulator):
             self._closed = True
             self._renderer.close()
             self.env.close()
+
+
+def _require_extent(view: View, name: str) -> None:
+    """Raise ConfigError where the view crops to no box of a scene's size: a grid would hold all in a few cells."""
+    longest = max(high - low for low, high in zip(*view.extent, strict=True))
+    if longest > _MOST_METRES:
+        raise ConfigError(
+            f"{name} has no voxel_grid: its clouds are cropped to a box of {longest:.4g} m; use obs_preset 'manicm_ms'"
+        )
 
 
 def _place_camera(model: mujoco.MjModel, name: str, pose: FixedPose) -> int:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass
 from importlib import metadata
 from typing import NamedTuple, Protocol
@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from packaging.requirements import Requirement
 
 from manicm_ms.errors import BackendError, ConfigError
+from manicm_ms.sensing.cropped import Sampler
 from manicm_ms.sensing.point_cloud import Box, sample_cloud
 from manicm_ms.spec import DP3_FRAME, WORLD_FRAME, ActionSpec, EnvSpec, ObsSpec
 
@@ -19,8 +20,6 @@ MANICM_MS, DP3 = "manicm_ms", "dp3"
 """Observation presets: the clean cloud in the world frame, and the one of the public DP3 wrapper."""
 
 Matrix3 = tuple[tuple[float, float, float], tuple[float, float, float], tuple[float, float, float]]
-Sampler = Callable[[NDArray[np.float32], int], NDArray[np.float32]]
-"""(points (M, C), P) -> (P, C)."""
 
 
 def sample_or_pad_with_zeros(points: NDArray[np.float32], num_points: int) -> NDArray[np.float32]:
@@ -137,6 +136,12 @@ class View:
     clip: tuple[float, float] | None = None
     solid: bool = True
     sampler: Sampler = sample_cloud
+
+    @property
+    def extent(self) -> Box:
+        """The box around all of the workspace."""
+        lows, highs = zip(*self.workspace, strict=True)
+        return Box(tuple(map(min, zip(*lows, strict=True))), tuple(map(max, zip(*highs, strict=True))))
 
 
 @dataclass(frozen=True)

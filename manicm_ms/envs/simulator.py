@@ -18,7 +18,7 @@ from manicm_ms.errors import ConfigError, require_at_least
 from manicm_ms.registry import TASKS, Registry
 from manicm_ms.sensing.camera import CameraModel
 from manicm_ms.sensing.realism import Realism, RealismSample, objects_of
-from manicm_ms.spec import AGENT_POS, DP3_FRAME, OBS_KEYS, POINT_CLOUD, EnvSpec
+from manicm_ms.spec import AGENT_POS, DP3_FRAME, OBS_KEYS, POINT_CLOUD, VOXEL_SIZE, EnvSpec
 
 OBS_PRESETS = ("manicm_ms", "dp3")
 """How observations are made: the package's own way, and that of the public DP3 wrapper (Adroit and Meta-World)."""
@@ -49,6 +49,7 @@ class SimulatorConfig:
         num_points: P, points of a cloud.
         colors: append rgb in [0, 1] to the cloud's xyz.
         image_size: (H, W) of the camera, pixels.
+        voxel_size: V, cells along each side of a voxel grid.
         video: make `render_video_frames` available (building takes some seconds longer).
         reward_mode: one of `REWARD_MODES`.
         device: "cpu", or the accelerator that simulates and renders.
@@ -63,6 +64,7 @@ class SimulatorConfig:
     num_points: int = 512
     colors: bool = False
     image_size: tuple[int, int] = (84, 84)
+    voxel_size: int = VOXEL_SIZE
     video: bool = False
     reward_mode: str = "sparse"
     device: str = "cpu"
@@ -78,7 +80,10 @@ class SimulatorConfig:
             raise ConfigError(f"unknown reward_mode {self.reward_mode!r}: choose from {', '.join(REWARD_MODES)}")
         if self.obs_preset not in OBS_PRESETS:
             raise ConfigError(f"unknown obs_preset {self.obs_preset!r}: choose from {', '.join(OBS_PRESETS)}")
-        require_at_least(1, num_envs=self.num_rows, num_points=self.num_points, image_size=min(self.image_size))
+        require_at_least(
+            1, num_envs=self.num_rows, num_points=self.num_points, image_size=min(self.image_size),
+            voxel_size=self.voxel_size,
+        )  # fmt: skip
 
     def require_ideal(self, env_id: str) -> None:
         """Raise ConfigError unless realism and camera are left out: for simulators that know neither."""
@@ -86,10 +91,11 @@ class SimulatorConfig:
             raise ConfigError(f"{env_id} has no realism presets and no camera file: use realism 'clean' and no camera")
 
     def specialise(self, spec: EnvSpec) -> EnvSpec:
-        """Return `spec` with the cloud and image shapes that this configuration asks for."""
+        """Return `spec` with the shapes of clouds, images and grids that this configuration asks for."""
         obs = replace(
-            spec.obs, num_points=self.num_points, point_channels=6 if self.colors else 3, image_size=self.image_size
-        )
+            spec.obs, num_points=self.num_points, point_channels=6 if self.colors else 3, image_size=self.image_size,
+            voxel_size=self.voxel_size,
+        )  # fmt: skip
         if self.obs_preset == "dp3":  # its clouds are in a frame of their own, agent_pos is not
             return replace(spec, obs=replace(obs, frame=DP3_FRAME), tcp_indices=None)
         return replace(spec, obs=obs)

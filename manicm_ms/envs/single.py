@@ -18,7 +18,7 @@ from manicm_ms.errors import ActionError, BackendError, ConfigError
 from manicm_ms.sensing.camera import CameraModel
 from manicm_ms.sensing.camera_files import read_camera
 from manicm_ms.sensing.realism import Realism, resolve_realism
-from manicm_ms.spec import AGENT_POS, POINT_CLOUD
+from manicm_ms.spec import AGENT_POS, POINT_CLOUD, VOXEL_SIZE
 
 _ROW = torch.zeros(1, dtype=torch.int64)
 _EVERY_ROW = np.ones(1, dtype=bool)
@@ -52,6 +52,7 @@ class SingleEnv(gymnasium.Env[dict[str, np.ndarray], np.ndarray]):
         num_points: int = 512,
         colors: bool = False,
         image_size: tuple[int, int] = (84, 84),
+        voxel_size: int = VOXEL_SIZE,
         reward_mode: str = "sparse",
         realism: str | Realism = "clean",
         camera: CameraModel | Path | str | None = None,
@@ -65,6 +66,7 @@ class SingleEnv(gymnasium.Env[dict[str, np.ndarray], np.ndarray]):
             num_points=num_points,
             colors=colors,
             image_size=image_size,
+            voxel_size=voxel_size,
             video=render_mode is not None,
             reward_mode=reward_mode,
             realism=resolve_realism(realism),

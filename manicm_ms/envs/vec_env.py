@@ -16,7 +16,7 @@ from manicm_ms.errors import ConfigError
 from manicm_ms.sensing.camera import CameraModel
 from manicm_ms.sensing.camera_files import read_camera
 from manicm_ms.sensing.realism import Realism, resolve_realism
-from manicm_ms.spec import AGENT_POS, POINT_CLOUD, ChunkSpec
+from manicm_ms.spec import AGENT_POS, POINT_CLOUD, VOXEL_SIZE, ChunkSpec
 
 ARRAYS = ("torch", "numpy")
 
@@ -32,6 +32,7 @@ def make_vec(
     num_points: int = ...,
     colors: bool = ...,
     image_size: tuple[int, int] = ...,
+    voxel_size: int = ...,
     video: bool = ...,
     reward_mode: str = ...,
     realism: str | Realism = ...,
@@ -52,6 +53,7 @@ def make_vec(
     num_points: int = ...,
     colors: bool = ...,
     image_size: tuple[int, int] = ...,
+    voxel_size: int = ...,
     video: bool = ...,
     reward_mode: str = ...,
     realism: str | Realism = ...,
@@ -71,6 +73,7 @@ def make_vec(
     num_points: int = 512,
     colors: bool = False,
     image_size: tuple[int, int] = (84, 84),
+    voxel_size: int = VOXEL_SIZE,
     video: bool = False,
     reward_mode: str = "sparse",
     realism: str | Realism = "clean",
@@ -90,6 +93,7 @@ def make_vec(
         num_points: points of a cloud.
         colors: append rgb to the points, (N, P, 6).
         image_size: (H, W) of the camera, pixels.
+        voxel_size: cells along each side of a voxel grid.
         video: make `render_video_frames` available; building takes some seconds longer.
         reward_mode: "sparse", "normalized_dense", "dense" or "none".
         realism: "clean", "d435i", "d435i+dr", or ranges of your own: what is drawn for each episode from its seed.
@@ -111,6 +115,7 @@ def make_vec(
         num_points=num_points,
         colors=colors,
         image_size=image_size,
+        voxel_size=voxel_size,
         video=video,
         reward_mode=reward_mode,
         device="cpu" if backend == "cpu" else "cuda",

@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch import Tensor
 
 from manicm_ms.envs.cameras import CLOUD_POSITION, COLOR, MICROMETRE
@@ -16,11 +17,14 @@ from manicm_ms.envs.lighting import Lamp, relight, tint
 from manicm_ms.envs.simulator import SimulatorConfig
 from manicm_ms.envs.ur3e_tabletop import UR3eTabletopEnv
 from manicm_ms.sensing.camera import CameraModel
+from manicm_ms.sensing.cropped import CROPPED, CroppedPoints, observe_cropped
 from manicm_ms.sensing.depth_cloud import nearest_pixels
-from manicm_ms.sensing.point_cloud import crop_transformed, inside, sample_cloud, sample_cloud_batch, transform
+from manicm_ms.sensing.point_cloud import crop_transformed, inside, transform
 from manicm_ms.sensing.realism import RealismRows, believed_poses, true_cameras
-from manicm_ms.spec import DEPTH, IMAGE, POINT_CLOUD
+from manicm_ms.spec import DEPTH, IMAGE, ObsSpec
 
+CROPPED_KEYS = frozenset(CROPPED.names())
+"""Observations that are made of the points within the workspace."""
 Pictures = dict[str, Tensor]
 """The cloud shader's pictures by name: `CLOUD_POSITION` (n, h, w, 4) int32, `COLOR` (n, h, w, 4) uint8."""
 
@@ -38,7 +42,7 @@ class View(ABC):
 
     @abstractmethod
     def frame(self, wanted: Sequence[str], pictures: Pictures, steps: Tensor) -> dict[str, Tensor]:
-        """Return what is `wanted` of point_cloud, depth and image, (n, ...); `steps` (n,) since each row's reset."""
+        """Return what is `wanted` of clouds, grids, depth and image, (n, ...); `steps` (n,) since each row's reset."""
 
 
 class IdealView(View):
@@ -47,10 +51,11 @@ class IdealView(View):
     Args:
         env: the scene; its camera and base stand still during an episode.
         config: sizes.
+        obs: what a frame holds.
     """
 
-    def __init__(self, env: UR3eTabletopEnv, config: SimulatorConfig) -> None:
-        self._env, self._config = env, config
+    def __init__(self, env: UR3eTabletopEnv, config: SimulatorConfig, obs: ObsSpec) -> None:
+        self._env, self._config, self._obs = env, config, obs
         self._T_base_camera: Tensor | None = None  # (n, 4, 4)
 
     def needs_color(self, wanted: Sequence[str]) -> bool:
@@ -65,29 +70,30 @@ class IdealView(View):
         """See `View.frame`."""
         position = pictures[CLOUD_POSITION]
         frame: dict[str, Tensor] = {}
-        if POINT_CLOUD in wanted:
-            frame[POINT_CLOUD] = self._cloud(position, pictures[COLOR] if self._config.colors else None)
+        if CROPPED_KEYS.intersection(wanted):
+            points = self._points(position, pictures[COLOR] if self._config.colors else None)
+            frame |= observe_cropped(wanted, points, self._env.workspace, self._obs)
         if DEPTH in wanted:
             frame[DEPTH] = -position[..., 2] * MICROMETRE
         if IMAGE in wanted:
             frame[IMAGE] = pictures[COLOR][..., :3]
         return frame
 
-    def _cloud(self, position: Tensor, color: Tensor | None) -> Tensor:
-        """Return clouds (n, P, C) of camera-space positions (n, H, W, 4) int32 and rgba (n, H, W, 4) uint8."""
+    def _points(self, position: Tensor, color: Tensor | None) -> CroppedPoints:
+        """Return what of camera-space positions (n, H, W, 4) int32 with rgba (n, H, W, 4) uint8 is in the workspace."""
         if self._T_base_camera is None:
             T_world_camera = self._env._sensors["d435i"].camera.get_model_matrix()
             T_base_world = self._env.agent.robot.pose.inv().to_transformation_matrix()
             self._T_base_camera = (T_base_world @ T_world_camera).float()
         if position.device.type == "cpu":
-            return torch.stack([self._row_cloud(k, position, color) for k in range(len(position))])
+            return CroppedPoints.of_rows([self._row_points(k, position, color) for k in range(len(position))])
         n = len(position)
         xyz = transform(position[..., :3].reshape(n, -1, 3) * MICROMETRE, self._T_base_camera)
         hit = position[..., 3].reshape(n, -1) != 0  # the background carries segmentation id 0
         points = xyz if color is None else torch.cat([xyz, color[..., :3].reshape(n, -1, 3) / 255.0], dim=-1)
-        return sample_cloud_batch(points, hit & inside(xyz, self._env.workspace), self._config.num_points)
+        return CroppedPoints(points, hit & inside(xyz, self._env.workspace))
 
-    def _row_cloud(self, row: int, position: Tensor, color: Tensor | None) -> Tensor:
+    def _row_points(self, row: int, position: Tensor, color: Tensor | None) -> NDArray[np.float32]:
         assert self._T_base_camera is not None
         pixels = position[row].reshape(-1, 4).numpy()
         hit = np.flatnonzero(pixels[:, 3])
@@ -96,7 +102,7 @@ class IdealView(View):
         if color is not None:
             rgb = color[row].reshape(-1, color.shape[-1])[:, :3].numpy()[hit[index]]
             points = np.concatenate([points, rgb / np.float32(255)], axis=1)
-        return torch.from_numpy(sample_cloud(points, self._config.num_points))
+        return points
 
 
 class CameraView(View):
@@ -106,13 +112,20 @@ class CameraView(View):
         env: the scene, built with `camera` as its `camera_model`.
         config: sizes, and the realism whose depth model is applied.
         camera: what the driver believes of the camera.
+        obs: what a frame holds.
         device: where pictures are rendered.
     """
 
     def __init__(
-        self, env: UR3eTabletopEnv, config: SimulatorConfig, camera: CameraModel, device: torch.device | str
+        self,
+        env: UR3eTabletopEnv,
+        config: SimulatorConfig,
+        camera: CameraModel,
+        obs: ObsSpec,
+        device: torch.device | str,
     ) -> None:
-        self._config, self._camera = config, camera
+        self._config, self._camera, self._obs = config, camera, obs
+        self._box = env.workspace  # of grids: one for all presets, whose floors differ
         workspace = env.workspace.raised(config.realism.crop_floor)
         self._clouds = DepthClouds(
             camera, config.realism.depth, workspace, config.num_points, config.num_rows,
@@ -144,9 +157,10 @@ class CameraView(View):
         lit = None
         if color is not None and (IMAGE in wanted or self._config.colors):
             lit = self._lit(color[..., :3], position)
-        if POINT_CLOUD in wanted or DEPTH in wanted:
-            depth, cloud = self._clouds.observe(position, steps, color, lit=lit)
-            frame[POINT_CLOUD], frame[DEPTH] = cloud, self._resized(depth)
+        if DEPTH in wanted or CROPPED_KEYS.intersection(wanted):
+            depth, points = self._clouds.observe_points(position, steps, color, lit=lit)
+            frame[DEPTH] = self._resized(depth)
+            frame |= observe_cropped(wanted, points, self._box, self._obs)
         if lit is not None:
             frame[IMAGE] = self._resized(lit)
         return {key: value for key, value in frame.items() if key in wanted}

@@ -15,24 +15,18 @@ from gymnasium import spaces
 from manicm_ms.envs.chunk import ActionChunk
 from manicm_ms.envs.simulator import ENVS, SimulatorConfig
 from manicm_ms.errors import ManicmError
-from manicm_ms.spec import AGENT_POS, DEPTH, IMAGE, POINT_CLOUD, STATE, ChunkSpec, EnvSpec
+from manicm_ms.spec import ANY, ChunkSpec, EnvSpec
 
 
 def observation_space(spec: EnvSpec, obs: tuple[str, ...], n_obs_steps: int | None) -> spaces.Dict:
     """Return the space of one row's observation; `n_obs_steps` adds the history axis, None leaves it out."""
-    height, width = spec.obs.image_size
-    shapes = {
-        POINT_CLOUD: (spec.obs.num_points, spec.obs.point_channels),
-        AGENT_POS: (spec.obs.agent_pos_dim,),
-        IMAGE: (height, width, 3),
-        DEPTH: (height, width),
-        STATE: (spec.state_dim,),
-    }
     history = () if n_obs_steps is None else (n_obs_steps,)
     boxes: dict[str, spaces.Space[Any]] = {}
     for key in obs:
-        low, high, dtype = (0, 255, np.uint8) if key == IMAGE else (-np.inf, np.inf, np.float32)
-        boxes[key] = spaces.Box(low, high, history + shapes[key], dtype)
+        field = spec.observation(key)
+        shape = tuple(spec.obs.num_points if n == ANY else n for n in field.shape)
+        low, high = (0, 255) if field.dtype == "uint8" else (-np.inf, np.inf)
+        boxes[key] = spaces.Box(low, high, history + shape, np.dtype(field.dtype).type)
     return spaces.Dict(boxes)
 
 

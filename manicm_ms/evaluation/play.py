@@ -15,7 +15,7 @@ from manicm_ms.evaluation.rollout import EpisodeResult, RestartableEnv, rollout
 from manicm_ms.machine.devices import torch_threads
 from manicm_ms.progress import progress_bars
 from manicm_ms.sensing.realism import REALISM, RealismSample
-from manicm_ms.spec import AGENT_POS, ChunkSpec, EnvSpec, require_compatible
+from manicm_ms.spec import AGENT_POS, EnvSpec, require_compatible
 
 if TYPE_CHECKING:
     from manicm_ms.envs.env_request import EnvRequest
@@ -42,11 +42,8 @@ def env_maker(request: EnvRequest) -> EnvMaker:
     """Return what makes the real environments that are asked for."""
 
     def for_policy(policy: Policy | UserPolicy, n: int, preset: str) -> VecEnv:
-        obs = policy.spec.obs
-        return request.vec_env(
-            n, realism=preset, obs=policy.keys, chunk=policy.chunk, num_points=obs.num_points,
-            colors=obs.point_channels == 6,
-        )  # fmt: skip
+        forms = policy.spec.obs.request(policy.keys)
+        return request.vec_env(n, realism=preset, obs=policy.keys, chunk=policy.chunk, **forms)
 
     def for_film(n: int, preset: str) -> VecEnv:
         return request.vec_env(n, realism=preset, obs=(AGENT_POS,), colors=False, video=True)
@@ -147,7 +144,8 @@ class _KeptEnv:
     def env_for(self, evaluated: EvaluatedPolicy) -> RestartableEnv:
         """Return an env that plays the policy's chunks, the one at hand where it does."""
         policy = evaluated.policy
-        shape = (*_exchange(policy.chunk, policy.spec), policy.keys)
+        chunk, forms = policy.chunk, policy.spec.obs.request(policy.keys)
+        shape = (chunk.n_obs_steps, chunk.n_action_steps, policy.keys, forms)
         if self._env is None or shape != self._shape:
             self._close()
             rows = self._protocol.num_envs
@@ -155,7 +153,7 @@ class _KeptEnv:
             self._shape = shape
         self.spec = self._env.env.env_spec
         env_name = f"environment {self.spec.env_id}"
-        require_compatible(self.spec, policy.spec, env_name, f"checkpoint {evaluated.checkpoint}")
+        require_compatible(self.spec, policy.spec, env_name, f"checkpoint {evaluated.checkpoint}", policy.keys)
         return self._env
 
     def _close(self) -> None:
@@ -168,10 +166,6 @@ class _KeptEnv:
 
     def __exit__(self, *exc: object) -> None:
         self._close()
-
-
-def _exchange(chunk: ChunkSpec, spec: EnvSpec) -> tuple[int, ...]:
-    return (chunk.n_obs_steps, chunk.n_action_steps, spec.obs.num_points, spec.obs.point_channels)
 
 
 def _successes(count: int) -> str:

@@ -84,7 +84,7 @@ def with_users(policies: Sequence[EvaluatedPolicy], sources: Sequence[str], spec
     Args:
         policies: loaded from checkpoints.
         sources: FILE.py:FUNCTION of each of the user's.
-        spec: of the environment; theirs has the clouds of the first checkpoint, where there is one.
+        spec: of the environment; theirs has clouds, pictures and grids as the first checkpoint's, where there is one.
 
     Raises:
         UserPolicyError: one cannot be made, or its first actions are unfit.
@@ -96,8 +96,8 @@ def with_users(policies: Sequence[EvaluatedPolicy], sources: Sequence[str], spec
         raise ConfigError("name at least one checkpoint folder, or a policy of your own by --policy FILE.py:FUNCTION")
     if policies:
         seen = policies[0].policy.spec.obs
-        clouds = replace(spec.obs, num_points=seen.num_points, point_channels=seen.point_channels)
-        spec = replace(spec, obs=clouds)
+        forms = {n: getattr(seen, n) for n in ("num_points", "point_channels", "image_size", "voxel_size")}
+        spec = replace(spec, obs=replace(spec.obs, **forms))
     found = list(policies)
     for source in sources:
         policy = load_user_policy(source, spec)

@@ -167,7 +167,8 @@ def rollout(
         raise ConfigError("every seed may be played once only: the list of seeds repeats some")
     env = vec_env.env if isinstance(vec_env, RestartableEnv) else vec_env
     require_chunk(env, policy.chunk)
-    require_compatible(env.env_spec, policy.spec, f"environment {env.env_spec.env_id}", "the policy")
+    keys = getattr(policy, "keys", ())
+    require_compatible(env.env_spec, policy.spec, f"environment {env.env_spec.env_id}", "the policy", keys)
     policy.eval()
     with torch.no_grad():
         results = _Rollout(vec_env, policy, seeds, on_episode, to_the_end).run()

@@ -16,7 +16,7 @@ from manicm_ms.errors import ManicmError, UserPolicyError
 from manicm_ms.evaluation.decisions import State
 from manicm_ms.policies.policy import example_observations
 from manicm_ms.registry import where_it_failed
-from manicm_ms.spec import AGENT_POS, POINT_CLOUD, ChunkSpec, EnvSpec
+from manicm_ms.spec import AGENT_POS, OBS_KEYS, POINT_CLOUD, ChunkSpec, EnvSpec
 
 FORM = "FILE.py:FUNCTION"
 _TRIAL_ROWS = 2
@@ -27,16 +27,16 @@ class UserPolicy:
 
     Args:
         source: where it comes from, FILE.py:FUNCTION, for messages.
-        made: the object: `chunk` (a `ChunkSpec`) and `act(obs, noise, state) -> (actions, state)`; `nfe`, `name`,
-            `device`, `eval` and `initial_state(n)` where it has them.
+        made: the object: `chunk` (a `ChunkSpec`) and `act(obs, noise, state) -> (actions, state)`; `keys` (the
+            observations that it reads; by default cloud and proprioception), `nfe`, `name`, `device`, `eval` and
+            `initial_state(n)` where it has them.
         spec: of the environment that it plays in.
 
     Raises:
-        UserPolicyError: the object lacks one of the two.
+        UserPolicyError: the object lacks one of the two, or its `keys` are no observations.
     """
 
     noise_draws = 1
-    keys = (POINT_CLOUD, AGENT_POS)
 
     def __init__(self, source: str, made: Any, spec: EnvSpec) -> None:
         self.source, self.spec, self._made = source, spec, made
@@ -50,6 +50,7 @@ class UserPolicy:
                 f"{source} returned a {type(made).__name__} without act(obs, noise, state) -> (actions, state)"
             )
         self.chunk: ChunkSpec = made.chunk
+        self.keys = self._checked_keys(getattr(made, "keys", (POINT_CLOUD, AGENT_POS)))
         nfe = getattr(made, "nfe", None)
         self.nfe: int | None = None if nfe is None else int(nfe)
         self.name = str(getattr(made, "name", Path(source.rpartition(":")[0]).stem))
@@ -84,6 +85,11 @@ class UserPolicy:
         if not callable(getattr(self._made, "initial_state", None)):
             after = None
         return self._checked_actions(actions, rows), None if after is None else self._checked_state(after, rows)
+
+    def _checked_keys(self, keys: Any) -> tuple[str, ...]:
+        if not isinstance(keys, tuple | list) or not keys or any(key not in OBS_KEYS for key in keys):
+            raise UserPolicyError(f"keys of {self.source} are {keys!r}: name some of {', '.join(OBS_KEYS)}")
+        return tuple(keys)
 
     def _checked_actions(self, actions: Any, rows: int) -> Tensor:
         actions = torch.from_numpy(actions) if isinstance(actions, np.ndarray) else actions

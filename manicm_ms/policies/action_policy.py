@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from typing import Any, ClassVar, NamedTuple
 
@@ -52,7 +52,7 @@ class ActionPolicy(Policy):
         name: of the method.
         spec: the environment that it is made for.
         chunk: To, Tp, Ta.
-        transforms: name -> transform, in order.
+        transforms: name -> transform, in order; those that change nothing that the encoder reads are left out.
         normalizer_config: how the normalizer is fitted.
         encoder: normalised observations to features.
         head: features to normalised chunks.
@@ -75,7 +75,8 @@ class ActionPolicy(Policy):
     ) -> None:
         super().__init__()
         self.name, self.spec, self.chunk = name, spec, chunk
-        self.keys = tuple(dict.fromkeys([*encoder.keys, *(key for t in transforms.values() for key in t.reads)]))
+        transforms = _effective(transforms, encoder.keys)
+        self.keys = _keys(encoder.keys, transforms)
         self.transforms = torch.nn.ModuleDict(transforms)
         self.normalizer_config = normalizer_config
         self.normalizer = normalizer if normalizer is not None else Normalizer(_channels(spec, self.keys))
@@ -176,7 +177,8 @@ class ActionPolicy(Policy):
     def _encoded(self, obs: Obs, read: Callable[[InputTransform, Obs], Obs]) -> Features:
         for transform in self._transforms:
             obs = read(transform, obs)
-        normalized = {key: self.normalizer.normalize(key, obs[key]) for key in self.keys}
+        ranged = self.normalizer.fields
+        normalized = {key: self.normalizer.normalize(key, obs[key]) if key in ranged else obs[key] for key in self.keys}
         for transform in self._transforms:
             normalized = transform.normalized(normalized, obs)
         return self.encoder(normalized)
@@ -235,6 +237,13 @@ def read_parts(config: Nested) -> Parts:
     return Parts(transforms, fitted, encoder, backbone, head)
 
 
+def keys_read(config: Nested, spec: EnvSpec) -> tuple[str, ...]:
+    """Return the observations that a policy of this configuration reads (`ActionPolicy.keys`) without building it."""
+    parts = read_parts(config)
+    transforms = {key: kind(fields, spec) for key, (kind, fields) in parts.inputs.items()}
+    return _keys(parts.encoder[0].keys, _effective(transforms, parts.encoder[0].keys))
+
+
 def build_policy(name: str, config: Nested, spec: EnvSpec, chunk: ChunkSpec) -> ActionPolicy:
     """Return the untrained policy that a configuration describes.
 
@@ -269,6 +278,15 @@ def _built(name: str, parts: Parts, spec: EnvSpec, chunk: ChunkSpec) -> ActionPo
     return ActionPolicy(name, spec, chunk, transforms, parts.normalizer, encoder, head)
 
 
+def _effective(transforms: Mapping[str, InputTransform], keys: Sequence[str]) -> dict[str, InputTransform]:
+    """Return the transforms that change what an encoder of `keys` reads, or do not say what they change."""
+    return {name: t for name, t in transforms.items() if not t.changes or set(t.changes) & set(keys)}
+
+
+def _keys(keys: Sequence[str], transforms: Mapping[str, InputTransform]) -> tuple[str, ...]:
+    return tuple(dict.fromkeys([*keys, *(key for t in transforms.values() for key in t.reads)]))
+
+
 def _part(registry: Registry[Any], config: Nested, key: str) -> tuple[Any, Any]:
     """Return the class that a section names and its configuration."""
     values = dict(_mapping(config.get(key) or {}, key))
@@ -296,8 +314,9 @@ def _name_of(registry: Registry[Any], part: Any) -> str:
 
 
 def _channels(spec: EnvSpec, keys: tuple[str, ...]) -> dict[str, int]:
-    """Return the channels of what is normalised: the last axis of each observation, and the actions."""
-    shapes = {key: spec.observation(key).shape for key in keys}
+    """Return the channels of what is normalised by its range: the last axis of each observation, and the actions."""
+    fields = {key: spec.observation(key) for key in keys}
+    shapes = {key: field.shape for key, field in fields.items() if field.by_range}
     if unfit := [key for key, shape in shapes.items() if shape[-1] == ANY]:
         raise ConfigError(f"{', '.join(unfit)} has no fixed number of channels, so that it cannot be normalised")
     return {**{key: shape[-1] for key, shape in shapes.items()}, ACTION: spec.action.dim}

@@ -33,11 +33,11 @@ def finite_obs(obs: Mapping[str, Tensor], spec: EnvSpec) -> Mapping[str, Tensor]
     Raises:
         NotFiniteError: a cloud's frame has no finite point, or another key holds NaN or infinity; it names the rows.
     """
-    values = list(obs.values())
-    if _recorded(values[0]) or _finite_sum(*values):
+    values = {key: value for key, value in obs.items() if value.is_floating_point()}  # whole numbers are finite
+    if not values or _recorded(next(iter(values.values()))) or _finite_sum(*values.values()):
         return obs
     found = dict(obs)
-    for key, value in obs.items():
+    for key, value in values.items():
         if key == POINT_CLOUD:
             found[key] = _without_bad_points(value)
         else:

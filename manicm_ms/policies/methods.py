@@ -7,137 +7,28 @@ from __future__ import annotations
 
 import copy
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import replace
 from typing import Any
 
 import torch
 
 from manicm_ms.errors import ConfigError
-from manicm_ms.policies.action_policy import ActionPolicy, NormalizerConfig, build_policy, read_parts
-from manicm_ms.policies.backbones.backbone import BACKBONES
-from manicm_ms.policies.configuration import NAME, PARTS, Nested, merged, section
-from manicm_ms.policies.encoders.encoder import ENCODERS
-from manicm_ms.policies.encoders.transform import TRANSFORMS
+from manicm_ms.policies.action_policy import ActionPolicy, build_policy
+from manicm_ms.policies.configuration import NAME, Nested
 from manicm_ms.policies.heads.consistency import ConsistencyHead
-from manicm_ms.policies.heads.diffusion import DiffusionHead
+from manicm_ms.policies.heads.diffusion import PREDICTIONS, DiffusionHead
 from manicm_ms.policies.heads.head import HEADS
+from manicm_ms.policies.method import METHODS, Method, described
 from manicm_ms.policies.policy import ChannelStats
-from manicm_ms.registry import TASKS, Registry
 from manicm_ms.spec import ChunkSpec, EnvSpec
 
 STUDENT = "manicm"
 """The method that a distillation makes of a teacher that no row names."""
 
 
-@dataclass(frozen=True, kw_only=True)
-class Method:
-    """A row: the parts of a method with their published values.
-
-    Attributes:
-        sentence: what it is, for users.
-        reference: where it was published.
-        encoder: name, or a mapping with `name` and the fields that differ from the encoder's own values.
-        backbone: the same for the network; None where the head needs none.
-        head: the same for the head.
-        objective: how it is trained: a name in `OBJECTIVES` for what learns from demonstrations, in `DISTILLATIONS` for
-            what learns from a teacher.
-        chunk: To, Tp, Ta.
-        size_chunks: name of a size -> chunk, where it is another one.
-        inputs: transform -> its fields, in order.
-        optimizer: fields of a training that are the method's rather than a preset's, as `weight_decay`.
-        nfe: network evaluations of one decision.
-        teachers: of a student: the methods that it is distilled from, the usual one first.
-    """
-
-    sentence: str
-    reference: str
-    encoder: str | Nested
-    head: str | Nested
-    objective: str
-    nfe: int
-    chunk: ChunkSpec
-    backbone: str | Nested | None = None
-    size_chunks: Mapping[str, ChunkSpec] = field(default_factory=dict)
-    inputs: Mapping[str, Nested] = field(default_factory=dict)
-    optimizer: Nested = field(default_factory=dict)
-    teachers: tuple[str, ...] = ()
-
-    def __post_init__(self) -> None:
-        for key in PARTS:
-            part = getattr(self, key)
-            described = _described(part)
-            optional = key == "backbone" and part is None
-            if not optional and not (isinstance(described, Mapping) and isinstance(described.get(NAME), str)):
-                raise ConfigError(
-                    f"{key} of a method is a name, or a mapping with {NAME!r} and its fields; got {part!r}"
-                )
-        if not all(isinstance(fields, Mapping) for fields in self.inputs.values()):
-            raise ConfigError(f"inputs of a method is a mapping of transforms to their fields, got {self.inputs!r}")
-        for lengths in (self.chunk, *self.size_chunks.values()):
-            if not isinstance(lengths, ChunkSpec):
-                raise ConfigError(f"chunk of a method is a ChunkSpec, got {lengths!r}")
-
-    def chunk_of(self, size: str, changes: Nested | None = None) -> ChunkSpec:
-        """Return To, Tp, Ta with a size, with fields of `changes` in place of its own.
-
-        Raises UnknownNameError or ConfigError where these are no lengths that fit together.
-        """
-        own = self.size_chunks.get(size, self.chunk)
-        lengths = {"n_obs_steps": own.n_obs_steps, "horizon": own.horizon, "n_action_steps": own.n_action_steps}
-        return section(ChunkSpec, {**lengths, **(changes or {})}, "chunk")
-
-    def configuration(self, size: str = "paper", changes: Nested | None = None) -> dict[str, Any]:
-        """Return the nested configuration of a policy: the row, then what the size says of each part, then `changes`.
-
-        Args:
-            size: "paper" for the published values, "quick" or "smoke" for each part's own smaller ones.
-            changes: sections as those of `build_policy`; one that names another part than the row takes that part's
-                values of this size.
-
-        Raises:
-            UnknownNameError, ConfigError: the row, or `changes`, names what does not exist or fit; see `build_policy`.
-        """
-        changes = changes or {}
-        row = {
-            "inputs": self.inputs,
-            "normalizer": {},
-            **{key: _described(getattr(self, key)) for key in ("encoder", "backbone", "head")},
-        }
-        chosen = merged(row, changes)
-        for key, registry in (("encoder", ENCODERS), ("backbone", BACKBONES), ("head", HEADS)):
-            if isinstance(chosen[key], Mapping) and isinstance(chosen[key].get(NAME), str):
-                name = chosen[key][NAME]
-                start = row[key] if row[key] and row[key][NAME] == name else {NAME: name}
-                chosen[key] = merged(
-                    merged(start, registry.get(name).sizes.get(size, {})), _described(changes.get(key))
-                )
-        if isinstance(chosen["inputs"], Mapping):
-            chosen["inputs"] = {
-                key: _changed(
-                    merged(self.inputs.get(key, {}), TRANSFORMS.get(key).sizes.get(size, {})),
-                    (changes.get("inputs") or {}).get(key),
-                )
-                for key in chosen["inputs"]
-            }
-        chosen["normalizer"] = _changed(NormalizerConfig.sizes.get(size, {}), changes.get("normalizer"))
-        read_parts(chosen)
-        return chosen
-
-
-def _changed(fields: Nested, changes: Any) -> Any:
-    """Return fields with changes; what is no mapping stands as it is, for `build_policy` to refuse with its path."""
-    return merged(fields, changes or {}) if changes is None or isinstance(changes, Mapping) else changes
-
-
-def _described(part: str | Nested | None) -> Any:
-    return {NAME: part} if isinstance(part, str) else part or {}
-
-
-METHODS: Registry[Method] = Registry("method", group="manicm_ms.methods", outside=TASKS)
-"""name -> row."""
-
 _CLOUD_INPUTS: Mapping[str, Nested] = {"cloud_crop": {}, "points": {}, "cloud_frame": {}}
 _DP3 = "Ze et al. 2024, 3D Diffusion Policy, arXiv:2403.03954"
+_MANICM = "Gao, Lu et al. 2024, ManiCM, arXiv:2406.01586"
 _PAPER = {"paper": ChunkSpec(2, 4, 2)}  # ManiCM, section 4.1
 _SIMPLE_UNET = {NAME: "unet1d", "down_dims": (128, 256, 384), "resnets_per_stage": 1, "mid_blocks": 1}
 
@@ -172,10 +63,55 @@ METHODS.add(
     ),
 )
 METHODS.add(
+    "dp",
+    Method(
+        sentence="Diffusion Policy from images: its hybrid ResNet-18 encoder on DP3's protocol, predicting noise.",
+        reference="Chi et al. 2023, Diffusion Policy, arXiv:2303.04137",
+        encoder="image",
+        backbone="unet1d",
+        head={NAME: "diffusion", "prediction_type": "epsilon"},
+        objective="averaged",
+        nfe=10,
+        chunk=ChunkSpec(2, 4, 3),
+        size_chunks=_PAPER,
+        inputs={"image_crop": {}},
+    ),
+)
+METHODS.add(
+    "voxel_dp",
+    Method(
+        sentence="DP3's teacher from voxel grids: eight 3D convolutions in place of the encoder of clouds.",
+        reference="encoder: Wang et al. 2024, Equivariant Diffusion Policy, arXiv:2407.01812",
+        encoder="voxel",
+        backbone="unet1d",
+        head="diffusion",
+        objective="averaged",
+        nfe=10,
+        chunk=ChunkSpec(2, 4, 3),
+        size_chunks=_PAPER,
+        inputs={"voxel_crop": {}},
+    ),
+)
+
+
+def _student_row(teacher: str, sentence: str) -> Method:
+    """Return the row of what is distilled from a teacher as ManiCM: the teacher's parts with a student's head."""
+    row = METHODS.get(teacher)
+    shared = ("prediction_type", "num_train_timesteps", "beta_schedule", "clip_range")
+    process = {name: value for name, value in described(row.head).items() if name in shared}
+    spacing = PREDICTIONS.get(process.get("prediction_type", "sample")).timestep_spacing
+    head = {NAME: "consistency", **process, "timestep_spacing": spacing}
+    reference = f"{_MANICM}; the teacher's: {row.reference}"
+    return replace(
+        row, sentence=sentence, reference=reference, head=head, objective="consistency", nfe=1, teachers=(teacher,)
+    )
+
+
+METHODS.add(
     STUDENT,
     Method(
         sentence="ManiCM's student, distilled from DP3 or Simple DP3: evaluated once a decision.",
-        reference="Gao, Lu et al. 2024, ManiCM, arXiv:2406.01586",
+        reference=_MANICM,
         encoder="dp3",
         backbone="unet1d",
         head="consistency",
@@ -218,19 +154,14 @@ METHODS.add(
 )
 METHODS.add(
     "pocket_manicm",
-    Method(
-        sentence="Pocket DP3's student, distilled as ManiCM: the mixer evaluated once a decision.",
-        reference="this package; ManiCM, arXiv:2406.01586, on the mixer of arXiv:2601.22018",
-        encoder="dp3",
-        backbone="mixer",
-        head="consistency",
-        objective="consistency",
-        nfe=1,
-        chunk=ChunkSpec(2, 4, 3),
-        size_chunks=_PAPER,
-        inputs=_CLOUD_INPUTS,
-        teachers=("pocket_dp3",),
-    ),
+    _student_row("pocket_dp3", "Pocket DP3's student, distilled as ManiCM: the mixer evaluated once a decision."),
+)
+METHODS.add(
+    "image_manicm", _student_row("dp", "ManiCM from camera images: the student of dp, evaluated once a decision.")
+)
+METHODS.add(
+    "voxel_manicm",
+    _student_row("voxel_dp", "ManiCM from voxel grids: the student of voxel_dp, evaluated once a decision."),
 )
 METHODS.add(
     "bc_rnn_3d",
@@ -301,7 +232,7 @@ def student_name(teacher: str) -> str:
 def methods_of(role: str) -> tuple[str, ...]:
     """Return the names of the methods whose head has this role in a distillation."""
     heads = {name: HEADS.get(name).role for name in HEADS.names()}  # a row may name a head that does not exist
-    return tuple(name for name in METHODS.names() if heads.get(_described(METHODS.get(name).head)[NAME]) == role)
+    return tuple(name for name in METHODS.names() if heads.get(described(METHODS.get(name).head)[NAME]) == role)
 
 
 def make_policy(
@@ -369,7 +300,7 @@ def head_with_nfe(method: str, nfe: int) -> Nested:
         ConfigError: it cannot.
     """
     row = METHODS.get(method)
-    field_ = HEADS.get(_described(row.head)[NAME]).nfe_field
+    field_ = HEADS.get(described(row.head)[NAME]).nfe_field
     if field_ is None and nfe != row.nfe:
         raise ConfigError(f"{method} takes {row.nfe} network evaluations a decision and no other number, got {nfe}")
     changes = {} if field_ is None else {field_: nfe}

@@ -2,13 +2,37 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from typing import Any
 
 from manicm_ms.policies.action_policy import ActionPolicy
+from manicm_ms.policies.methods import METHODS
+from manicm_ms.spec import AGENT_POS, DEPTH, IMAGE, POINT_CLOUD, STATE, VOXEL_GRID, EnvSpec
 
 LICENSE = "MIT"
 _LONG_LIST = 12  # numbers; longer lists are shown by their range
+
+_CHANNELS = {3: "x, y, z", 6: "x, y, z, r, g, b"}
+_SEEN: Mapping[str, tuple[str, Callable[[EnvSpec], str]]] = {
+    POINT_CLOUD: (
+        "point clouds",
+        lambda spec: f"clouds of {_CHANNELS[spec.obs.point_channels]} (metres, frame `{spec.obs.frame}`)"
+    ),
+    AGENT_POS: ("proprioception", lambda spec: f"agent_pos of {spec.obs.agent_pos_dim}"),
+    IMAGE: ("images", lambda spec: f"images of {_sides(spec.obs.image_size)} pixels"),
+    DEPTH: ("depth images", lambda spec: f"depth of {_sides(spec.obs.image_size)} pixels (metres)"),
+    STATE: ("states", lambda spec: f"the privileged state of {spec.state_dim}"),
+    VOXEL_GRID: (
+        "voxel grids",
+        lambda spec: f"voxel grids of {_sides(spec.observation(VOXEL_GRID).shape)} (frame `{spec.obs.frame}`)",
+    ),
+}  # fmt: skip
+"""Observation key -> what it is called, and how its form is described."""
+
+
+def _sides(shape: tuple[int, ...]) -> str:
+    return " x ".join(map(str, shape))
+
 
 _TITLES = {"teacher": "diffusion teacher", "student": "consistency student"}
 
@@ -24,23 +48,24 @@ def model_card(policy: ActionPolicy, provenance: Mapping[str, Any], dtype: str) 
     spec, chunk = policy.spec, policy.chunk
     role = _TITLES.get(policy.role or "", "policy")
     parameters = sum(p.numel() for p in policy.parameters())
-    channels = {3: "x, y, z", 6: "x, y, z, r, g, b"}[spec.obs.point_channels]
+    seen = [_SEEN[key] for key in policy.keys]
+    method = [f"| Method | {METHODS.get(policy.name).sentence} |"] if policy.name in METHODS.names() else []
     lines = [
         "---",
         f"license: {LICENSE.lower()}",
         "library_name: manicm_ms",
-        "tags: [robotics, imitation-learning, point-cloud]",
+        f"tags: [robotics, imitation-learning, {seen[0][0].rstrip('s').replace(' ', '-')}]",
         "---",
         f"# {policy.name} for {spec.env_id}",
         "",
-        f"A {role} that maps point clouds to action chunks, written by manicm_ms.",
+        f"A {role} that maps {seen[0][0]} to action chunks, written by manicm_ms.",
         "",
         "| | |",
         "|---|---|",
+        *method,
         f"| Parameters | {parameters:,}, stored as {dtype} |",
         f"| Network evaluations a decision | {policy.nfe} |",
-        f"| Reads | {chunk.n_obs_steps} frames: clouds of {channels} (metres, frame `{spec.obs.frame}`), "
-        f"agent_pos of {spec.obs.agent_pos_dim} |",
+        f"| Reads | {chunk.n_obs_steps} frames: {', '.join(describe(spec) for _, describe in seen)} |",
         f"| Predicts | {chunk.horizon} actions, of which {chunk.n_action_steps} are executed |",
         f"| Action | {', '.join(spec.action.names)}; normalised to [-1, 1] |",
         f"| Control | `{spec.action.control_mode}` at {spec.action.control_hz:g} Hz |",

@@ -94,7 +94,7 @@ class Policy(nn.Module, ABC):
         """Choose the next actions.
 
         Args:
-            obs: `point_cloud` (B, To, P, C) and `agent_pos` (B, To, D), float32, units and frame of `spec`,
+            obs: each of `keys` as (B, To, ...), as `point_cloud` (B, To, P, C), in type, unit and frame of `spec`,
                 on the policy's device; frames in order of time, the present one last.
             generator: source of the Gaussian noise; torch's default generator where it is None. Noise is
                 drawn on the generator's device and then moved, so a CPU generator gives every device the same.
@@ -136,6 +136,11 @@ def check_obs(obs: Mapping[str, Tensor], spec: EnvSpec, chunk: ChunkSpec, keys: 
             raise SpecMismatchError(
                 f"{key} has shape {shape} and this policy reads ({axes}): make the environment with the policy's chunk"
             )
+        if (spec.observation(key).dtype == "uint8") != (obs[key].dtype == torch.uint8):
+            raise SpecMismatchError(
+                f"{key} is {obs[key].dtype} and this policy reads {spec.observation(key).dtype}: hand it over as it is "
+                "observed"
+            )
         rows = shape[0]
     return rows
 
@@ -143,7 +148,7 @@ def check_obs(obs: Mapping[str, Tensor], spec: EnvSpec, chunk: ChunkSpec, keys: 
 def example_observations(policy: Observer, batch: int = 1, seed: int = 0) -> dict[str, Tensor]:
     """Return observations of the right shapes for any policy, on the CPU: each key that it reads as (B, To, ...).
 
-    Values are uniform in [0, 1): a decision takes the same operations whatever they are.
+    Values are uniform, in [0, 1) or over all bytes: a decision takes the same operations whatever they are.
 
     Args:
         policy: ours, or a user's own with `spec` and `chunk`.
@@ -154,7 +159,11 @@ def example_observations(policy: Observer, batch: int = 1, seed: int = 0) -> dic
     found = {}
     for key in getattr(policy, "keys", (POINT_CLOUD, AGENT_POS)):
         shape = tuple(policy.spec.obs.num_points if n == ANY else n for n in policy.spec.observation(key).shape)
-        found[key] = torch.rand((batch, policy.chunk.n_obs_steps, *shape), generator=generator)
+        full = (batch, policy.chunk.n_obs_steps, *shape)
+        if policy.spec.observation(key).dtype == "uint8":
+            found[key] = torch.randint(256, full, generator=generator, dtype=torch.uint8)
+        else:
+            found[key] = torch.rand(full, generator=generator)
     return found
 
 

@@ -71,8 +71,9 @@ def distill(
     require_seed(seed)
     teacher, objective_type = Path(teacher), DISTILLATIONS.get(preset.objective)
     policy = _load_teacher(teacher)
-    demos = read_demos(data, policy.chunk)
-    require_compatible(demos.spec, policy.spec, f"the data {demos.provenance['path']}", f"the teacher {teacher}")
+    demos = read_demos(data, policy.chunk, policy.keys, f"the teacher {teacher}")
+    source = f"the data {demos.provenance['path']}"
+    require_compatible(demos.spec, policy.spec, source, f"the teacher {teacher}", policy.keys)
     if not allow_other_task:
         _require_same_task(demos.spec, demos.provenance["path"], policy.spec, teacher)
     student = student_of(policy, nfe=preset.nfe, num_solver_steps=_solver_steps(policy, preset.solver_stride))

@@ -102,7 +102,7 @@ def _resolved(config: Nested) -> dict[str, Any]:
     parts = read_parts({key: value for key, value in config.items() if key != CHUNK})
     named = {"encoder": parts.encoder, "backbone": parts.backbone, "head": parts.head, **parts.inputs}
     told = {key: None if part is None else [part[0].__qualname__, asdict(part[1])] for key, part in named.items()}
-    idle = [key for key, fields in _PARTS_ADDED_LATER.items() if key in named and named[key][1] == fields]
+    idle = [key for key, fields in _PARTS_ADDED_LATER.items() if key in parts.inputs and parts.inputs[key][1] == fields]
     return {key: value for key, value in told.items() if key not in idle} | {"normalizer": asdict(parts.normalizer)}
 
 

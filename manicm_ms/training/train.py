@@ -13,8 +13,8 @@ from manicm_ms.errors import ConfigError
 from manicm_ms.policies.action_policy import ActionPolicy, build_policy
 from manicm_ms.policies.methods import METHODS
 from manicm_ms.seeds import require_seed
-from manicm_ms.spec import ChunkSpec
-from manicm_ms.training.demonstrations import Data, Demos, read_demos
+from manicm_ms.spec import ChunkSpec, EnvSpec
+from manicm_ms.training.demonstrations import Data, read_demos, spec_of
 from manicm_ms.training.loop import Batches
 from manicm_ms.training.objectives.objective import DISTILLATIONS, OBJECTIVES, OnDemonstrations, PolicyObjective
 from manicm_ms.training.optim import PowerDecay
@@ -64,8 +64,9 @@ def train(
     objective = objective_of(method)
     config = preset.configuration(method)
     chunk = ChunkSpec(**config.pop(CHUNK))
-    demos = read_demos(data, chunk)
-    policy = _untrained(method, config, demos, chunk, seed)
+    policy = _untrained(method, config, spec_of(data), chunk, seed)
+    demos = read_demos(data, chunk, policy.keys, method)
+    policy.fit_normalizer(demos.stats)
     session = Session.start(
         "teacher",
         out,
@@ -101,10 +102,8 @@ def objective_of(method: str) -> OnDemonstrations:
     return OBJECTIVES.get(name)
 
 
-def _untrained(method: str, config: Mapping[str, Any], demos: Demos, chunk: ChunkSpec, seed: int) -> ActionPolicy:
-    """Return the policy that a configuration describes, its normalizer fitted to the demonstrations."""
+def _untrained(method: str, config: Mapping[str, Any], spec: EnvSpec, chunk: ChunkSpec, seed: int) -> ActionPolicy:
+    """Return the policy that a configuration describes."""
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(seed)
-        policy = build_policy(method, config, demos.spec, chunk)
-    policy.fit_normalizer(demos.stats)
-    return policy
+        return build_policy(method, config, spec, chunk)

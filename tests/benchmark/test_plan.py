@@ -1,12 +1,14 @@
 """What a benchmark may be asked: names, seeds, methods and their teachers."""
 
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
 
-from manicm_ms.benchmark.jobs import all_jobs
+from manicm_ms.benchmark.jobs import CollectJob, all_jobs
 from manicm_ms.benchmark.methods import OneStep, Steps, Student, Trained, parse_methods
 from manicm_ms.benchmark.plan import Plan, parse_envs, parse_seeds
+from manicm_ms.demos.store import DemoStore
 from manicm_ms.envs.simulator import ENVS
 from manicm_ms.errors import ConfigError, UnknownNameError
 
@@ -145,6 +147,26 @@ def test_students_of_two_teachers_have_folders_of_their_own():
     assert len(set(folders)) == 5
     alone = plan(methods=("simple_dp3", "manicm"))
     assert alone.folder("adroit/door", 0, alone.parsed_methods[1]) == folders[3], "however it is called"
+
+
+@pytest.mark.parametrize(
+    ("methods", "extras"),
+    [
+        (("simple_dp3", "one_step", "manicm"), ()),
+        (("dp", "one_step"), ("image",)),
+        (("simple_dp3", "manicm:voxel_dp", "dp"), ("image", "voxel_grid")),
+    ],
+)
+def test_what_the_methods_read_is_collected_and_a_store_that_holds_more_is_taken(tmp_path, methods, extras):
+    spec = ENVS.get("metaworld/reach").spec
+    asked = plan(methods=methods, data=tmp_path)
+    assert asked.extras(spec) == extras
+    collection = next(job for job in all_jobs(asked) if isinstance(job, CollectJob))
+    path = tmp_path / "metaworld" / "reach.zarr"
+    assert collection._extras(path) == {"extras": extras}
+    fine = replace(spec, obs=replace(spec.obs, voxel_size=64))
+    DemoStore.create(path, fine, {}, extras=("image", "depth", "voxel_grid")).close()
+    assert collection._extras(path) == {"extras": ("image", "depth", "voxel_grid"), "voxel_size": 64}
 
 
 def test_no_demonstration_judges_a_policy():

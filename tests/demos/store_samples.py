@@ -8,7 +8,7 @@ from manicm_ms.spec import ActionSpec, EnvSpec, ObsSpec
 
 SPEC = EnvSpec(
     env_id="toy/sample",
-    obs=ObsSpec(16, 3, 4, "robot_base", image_size=(6, 8)),
+    obs=ObsSpec(16, 3, 4, "robot_base", image_size=(6, 8), voxel_size=6),
     action=ActionSpec(("a", "b"), "velocity", 20.0),
     max_episode_steps=30,
     agent_pos_names=("x (m)", "y (m)", "z (m)", "gripper (m)"),
@@ -27,6 +27,7 @@ def episode(seed, length=None, **changes):
         "image": rng.integers(0, 256, (length, 6, 8, 3), dtype="u1"),
         "depth": rng.uniform(0, 2, (length, 6, 8)).astype("f4"),
         "privileged_state": rng.normal(size=(length, 3)).astype("f4"),
+        "voxel_grid": rng.integers(0, 2, (length, 1, 6, 6, 6), dtype="u1") * 255,
     }
     return Episode(**(arrays | {"seed": seed, "success": True} | changes))
 

@@ -183,9 +183,10 @@ def test_a_kill_at_any_file_operation_leaves_what_was_committed(tmp_path):
     assert int(done.stdout) > 20  # each of so many moments was tried
 
 
-def test_an_interrupted_append_leaves_no_trace(tmp_path):
-    whole = make_store(tmp_path / "whole.zarr", (*SEEDS, 7))
-    broken = make_store(tmp_path / "broken.zarr", SEEDS)
+@pytest.mark.parametrize("extras", [(), ("image", "voxel_grid")])
+def test_an_interrupted_append_leaves_no_trace(tmp_path, extras):
+    whole = make_store(tmp_path / "whole.zarr", (*SEEDS, 7), extras)
+    broken = make_store(tmp_path / "broken.zarr", SEEDS, extras)
     with DemoStore.open(broken, "a") as store:
         store._arrays.write({f: getattr(episode(100), f) for f in store.fields}, episode(100), np.zeros(0))
     with DemoStore.open(broken) as store:

@@ -7,7 +7,7 @@ import torch
 from manicm_ms.envs.cameras import CLOUD_POSITION, D435I, MICROMETRE
 from manicm_ms.envs.simulator import ENVS, SimulatorConfig
 from manicm_ms.sensing.point_cloud import Box
-from manicm_ms.spec import DEPTH, IMAGE, POINT_CLOUD, STATE
+from manicm_ms.spec import DEPTH, IMAGE, POINT_CLOUD, STATE, VOXEL_GRID
 
 ENV_ID = "ur3e/slide-block"
 ACCURACY = 2e-5  # m: the renderer interpolates in single precision, some 0.7 m away
@@ -174,3 +174,18 @@ def test_colours_belong_to_their_points():
     on_block = cloud[:, 2] > 0.062  # above the cube's top, in the start scene, is the block alone
     assert on_block.any()
     assert cloud[on_block, 3:].mean() < cloud[~on_block, 3:].mean(), "the block is grey, the cube white"
+
+
+def test_a_voxel_grid_holds_the_cropped_pixels_and_every_sampled_point(simulator, frame):
+    pictures = simulator._pictures(color=False)
+    views = [simulator._view.frame((VOXEL_GRID,), pictures, simulator._steps)[VOXEL_GRID] for _ in range(2)]
+    assert torch.equal(*views)
+    grid, box = views[0][0, 0].numpy(), simulator.env.workspace
+    low, side = np.array(box.low), (np.array(box.high) - box.low) / len(grid)
+    points, ids = uncropped(simulator)
+    inside = (ids != 0) & (points > box.low).all(axis=1) & (points < box.high).all(axis=1)
+    for seen in (points[inside], frame[POINT_CLOUD][0].numpy()):
+        middle = np.abs((seen - low) / side % 1 - 0.5).max(axis=1) < 0.49  # else rounding may decide
+        cells = {tuple(cell) for cell in ((seen[middle] - low) // side).astype(int).tolist()}
+        assert cells <= {tuple(cell) for cell in np.argwhere(grid == 255).tolist()}
+    assert grid.astype(bool).sum() <= inside.sum()

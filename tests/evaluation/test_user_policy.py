@@ -3,6 +3,7 @@
 import io
 import json
 import textwrap
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -211,3 +212,15 @@ class Deterministic(Proportional):
 def test_a_policy_of_ours_may_draw_nothing():
     results = rollout(PointMass(2), Deterministic(), range(4))
     assert [e.crashed for e in results] == [None] * 4
+
+
+def test_it_may_name_what_it_reads(tmp_path):
+    named = MINIMAL.replace("chunk =", 'keys = ["state", "image"]\n        chunk =').replace(
+        'obs["agent_pos"][:, -1]', 'obs["state"][:, -1, :2] + 0 * obs["image"].float().mean()'
+    )
+    spec = replace(SPEC, state_layout={"position": (0, 2)})
+    assert load_user_policy(write(tmp_path, named), spec).keys == ("state", "image")
+    with pytest.raises(
+        UserPolicyError, match=r"keys of .* are \['sound'\]: name some of point_cloud, agent_pos, image"
+    ):
+        load_user_policy(write(tmp_path, MINIMAL.replace("chunk =", 'keys = ["sound"]\n        chunk =')), SPEC)

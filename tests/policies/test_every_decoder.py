@@ -9,6 +9,7 @@ from manicm_ms.policies.configuration import parse_overrides
 from manicm_ms.policies.encoders.encoder import Features
 from manicm_ms.policies.heads.head import HEADS, TrainableHead
 from manicm_ms.policies.methods import METHODS, make_policy
+from manicm_ms.policies.policy import example_observations
 
 SPEC = make_spec()
 GENERATIVE = [name for name in METHODS.names() if METHODS.get(name).backbone is not None and not name.startswith("toy")]
@@ -25,7 +26,7 @@ def smoke(method, *overrides):
 def test_the_decoder_is_a_choice(method, decoder):
     policy = smoke(method, f"backbone={decoder}")
     assert policy.config_dict()["backbone"]["name"] == decoder
-    obs = make_obs(SPEC, 3)
+    obs = example_observations(policy, 3)
     assert policy.act(obs, generator=torch.Generator().manual_seed(0)).shape == (3, 3, 3)
     if isinstance(policy.head, TrainableHead):
         loss = policy.head.loss(policy.encode(obs), torch.zeros(3, 4, 3), torch.Generator().manual_seed(0))
@@ -39,7 +40,7 @@ def evaluations(policy):
     """Count how often the network answers in one decision: the backbone, or a head's own last layer."""
     count, network = [], policy.head.backbone if policy.head.backbone is not None else policy.head.output
     hook = network.register_forward_hook(lambda *args: count.append(1))
-    policy.act(make_obs(SPEC, 2, chunk=policy.chunk), generator=torch.Generator().manual_seed(0))
+    policy.act(example_observations(policy, 2), generator=torch.Generator().manual_seed(0))
     hook.remove()
     return len(count)
 

@@ -8,7 +8,8 @@ from table_view import CAMERA, EVERYWHERE, WORKSPACE, H, W, in_base, table_depth
 
 from manicm_ms.errors import CameraError
 from manicm_ms.sensing import depth_cloud, point_cloud
-from manicm_ms.sensing.depth_cloud import depth_to_cloud, nearest_pixels
+from manicm_ms.sensing.depth_cloud import depth_to_cloud, depth_to_points, nearest_pixels
+from manicm_ms.sensing.point_cloud import sample_cloud_batch
 
 
 def test_nearest_neighbours_of_a_resize():
@@ -87,8 +88,9 @@ def test_all_rows_together_give_what_one_after_the_other_does(monkeypatch, color
     depth[2] = 0.0
     rgb = torch.rand(3, H, W, 3, generator=generator) if colored else None
     by_row = depth_to_cloud(depth, CAMERA, WORKSPACE, 64, rgb=rgb)
-    monkeypatch.setattr(depth_cloud, "_clouds_by_row", depth_cloud._clouds_together)  # as on a device
-    torch.testing.assert_close(depth_to_cloud(depth, CAMERA, WORKSPACE, 64, rgb=rgb), by_row, atol=1e-6, rtol=0)
+    monkeypatch.setattr(depth_cloud, "_points_by_row", depth_cloud._points_together)  # as on a device
+    together = sample_cloud_batch(*depth_to_points(depth, CAMERA, WORKSPACE, rgb=rgb), 64)
+    torch.testing.assert_close(together, by_row, atol=1e-6, rtol=0)
     assert by_row[:2].any(dim=-1).all()
 
 

@@ -29,6 +29,7 @@ KEYS = {
     "image": "observation.images.camera",
     "depth": "observation.depth",
     "privileged_state": "observation.environment_state",
+    "voxel_grid": "observation.voxel_grid",
     "action": "action",
 }
 """Field of `Episode` -> feature of the data set."""
@@ -71,6 +72,7 @@ def features(spec: EnvSpec, fields: tuple[str, ...]) -> dict[str, dict[str, Any]
         "point_cloud": ["point", "channel"],
         "image": ["height", "width", "channel"],
         "depth": ["height", "width"],
+        "voxel_grid": ["channel", "x", "y", "z"],
         "privileged_state": [f"{n}_{k}" for n, (low, high) in spec.state_layout.items() for k in range(high - low)],
     }
     described: dict[str, dict[str, Any]] = {}

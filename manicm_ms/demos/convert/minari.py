@@ -53,7 +53,7 @@ def export(job: Export) -> Tally:
 
 def spaces(spec: EnvSpec, fields: tuple[str, ...]) -> dict[str, Any]:
     """Return (low, high, shape, type) of a frame of each field."""
-    bounds = {"action": (-1.0, 1.0), "image": (0, 255)}
+    bounds = {"action": (-1.0, 1.0), "image": (0, 255), "voxel_grid": (0, 255)}
     return {
         name: (*bounds.get(name, (-np.inf, np.inf)), shape, dtype.name)
         for name, (shape, dtype) in frame_shapes(spec).items()

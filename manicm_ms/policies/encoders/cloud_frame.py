@@ -119,6 +119,7 @@ class CloudFrame(InputTransform):
 
     Config = CloudFrameConfig
     sizes: ClassVar = {"quick": {"frame": "auto"}, "smoke": {"frame": "auto"}}
+    changes = (POINT_CLOUD,)
 
     def __init__(self, config: CloudFrameConfig, spec: EnvSpec) -> None:
         super().__init__(config, spec)

@@ -50,7 +50,8 @@ class ObsEncoder(nn.Module, ABC):
     Attributes:
         Config: dataclass of its fields.
         sizes: name of a size ("smoke", "quick", "paper") -> fields that differ from the published ones.
-        keys: observations that it reads.
+        keys: observations that it reads. Those of a `FieldSpec` with `by_range` come normalised to [-1, 1]; the others
+            as they are, which the encoder scales itself.
         config: the fields that it was made with.
         shape: sizes of its features.
     """
@@ -68,7 +69,7 @@ class ObsEncoder(nn.Module, ABC):
 
     @abstractmethod
     def forward(self, obs: Mapping[str, Tensor]) -> Features:
-        """Return the features of normalised observations: each of `keys` as (B, To, ...)."""
+        """Return the features of observations, normalised as `keys` says: each of `keys` as (B, To, ...)."""
 
 
 ENCODERS: Registry[type[ObsEncoder]] = Registry(

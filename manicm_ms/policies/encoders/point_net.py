@@ -6,11 +6,11 @@ import itertools
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
-import torch
 from torch import Tensor, nn
 
 from manicm_ms.errors import ConfigError, require_at_least
 from manicm_ms.policies.encoders.encoder import ENCODERS, Features, FeatureShape, ObsEncoder
+from manicm_ms.policies.encoders.state import frame_features, state_mlp
 from manicm_ms.spec import AGENT_POS, POINT_CLOUD, ChunkSpec, EnvSpec
 
 
@@ -84,10 +84,7 @@ class DP3Encoder(ObsEncoder):
     def __init__(self, config: DP3EncoderConfig, spec: EnvSpec, chunk: ChunkSpec) -> None:
         super().__init__(config, spec, chunk)
         self.points = PointNet(spec.obs.point_channels, config.point_widths, config.point_features)
-        layers: list[nn.Module] = []
-        for fan_in, fan_out in itertools.pairwise((spec.obs.agent_pos_dim, *config.state_widths)):
-            layers += [nn.Linear(fan_in, fan_out), nn.ReLU()]
-        self.state = nn.Sequential(*layers[:-1])  # no activation after the last layer
+        self.state = state_mlp(spec.obs.agent_pos_dim, config.state_widths)
         width = config.point_features + config.state_widths[-1]
         self.shape = FeatureShape(chunk.n_obs_steps * width, (chunk.n_obs_steps, width))
 
@@ -96,6 +93,4 @@ class DP3Encoder(ObsEncoder):
         cloud, agent_pos = obs[POINT_CLOUD], obs[AGENT_POS]
         cloud_features = self.points(cloud.flatten(0, 1))  # (B To, F)
         state_features = self.state(agent_pos.flatten(0, 1))  # (B To, F')
-        frames = torch.cat([cloud_features, state_features], dim=-1)
-        tokens = frames.unflatten(0, cloud.shape[:2])  # (B, To, F + F')
-        return Features(tokens.flatten(1), tokens)
+        return frame_features([cloud_features, state_features], cloud.shape[1])

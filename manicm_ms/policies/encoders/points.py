@@ -111,7 +111,7 @@ class PointSubset(InputTransform):
     """
 
     Config = PointSubsetConfig
-    reads = (POINT_CLOUD,)
+    reads = changes = (POINT_CLOUD,)
     sizes: ClassVar = {"quick": {"max_points": 128}, "smoke": {"max_points": 64}}
     config: PointSubsetConfig
 

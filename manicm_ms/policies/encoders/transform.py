@@ -26,12 +26,15 @@ class InputTransform(nn.Module, ABC):
         Config: dataclass of its fields.
         sizes: name of a size ("smoke", "quick", "paper") -> fields that differ from the published ones.
         reads: observations that it reads; the policy asks for them beside the encoder's.
+        changes: observations that it changes; where the encoder reads none of them it has no part in a policy, which
+            then does not ask for what it reads. Empty for one that is never left out.
         config: the fields that it was made with, those resolved that the environment decides.
     """
 
     Config: ClassVar[type[Any]]
     sizes: ClassVar[Mapping[str, Mapping[str, Any]]] = {}
     reads: tuple[str, ...] = ()
+    changes: tuple[str, ...] = ()
     config: Any
 
     def __init__(self, config: Any, spec: EnvSpec) -> None:
