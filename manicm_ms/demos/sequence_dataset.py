@@ -52,7 +52,7 @@ def sequence_index(episode_ends: np.ndarray, chunk: ChunkSpec) -> np.ndarray:
 CLOUD_KEYS = (POINT_CLOUD, AGENT_POS)
 """What every store holds, and most policies read."""
 MOST_HELD_BYTES = 2 << 30
-"""Frames of one observation that are held in memory: of more, batches are read from the disk."""
+"""Pictures or grids that are held in memory: of more, batches are read from the disk."""
 
 
 class Frames(Protocol):
@@ -129,10 +129,12 @@ class JoinedFrames:
 def frames_of(store: DemoStore, key: str, most_bytes: int | None = None) -> Tensor | StoredFrames:
     """Return the committed frames of an observation, or of the actions, in the type that they are stored in.
 
-    They are held in memory where they take up to `most_bytes` (None: `MOST_HELD_BYTES`), else they stay on the disk.
+    Pictures and grids of more than `most_bytes` (None: `MOST_HELD_BYTES`) stay on the disk; what is scaled by its range is
+    held in memory.
     """
     field, count = FIELD_OF_OBS.get(key, key), store.num_frames
-    if store.frame_bytes(field) * count <= (MOST_HELD_BYTES if most_bytes is None else most_bytes):
+    most = MOST_HELD_BYTES if most_bytes is None else most_bytes
+    if key == ACTION or store.spec.observation(key).by_range or store.frame_bytes(field) * count <= most:
         return torch.from_numpy(store.frames(field, 0, count))
     return StoredFrames(partial(store.frames_at, field), count)
 
