@@ -105,6 +105,15 @@ def test_samples_that_lie_together_far_from_the_data_are_drawn_to_it():
     assert (torch.cosine_similarity(field, y - a, dim=-1) > 0.95).all()
 
 
+def test_samples_that_lie_together_amid_two_demonstrations_rest_on_average():
+    """The published field rests here too: a force is P_i sum_j N_ij (y - a_j), whose mean over y vanishes."""
+    g = torch.Generator().manual_seed(0)
+    a, y = 1e-3 * torch.randn(1, 4, 12, generator=g).expand(2, 4, 12), torch.ones(2, 1, 12)
+    y[1] = -1
+    field = drift_field(a, a, y, TEMPERATURES).field
+    assert field.mean(0).abs().max() < 0.01 * field.abs().max()
+
+
 # ---- the head -------------------------------------------------------------------------------------------------------
 
 SMALL = {
