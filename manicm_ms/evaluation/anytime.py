@@ -17,7 +17,7 @@ from scipy.special import betaln, logsumexp
 from manicm_ms.errors import ConfigError
 from manicm_ms.evaluation.intervals import CONFIDENCE
 
-ALPHA = 1 - CONFIDENCE
+ALPHA = round(1 - CONFIDENCE, 9)
 EACH_ALPHA = ALPHA / 2
 """Of each of two bets that run side by side; Tango's interval leaves the same beyond each of its ends."""
 STAKES = 20

@@ -114,7 +114,7 @@ def _remarks(contestants: Sequence[Contestant], seeds: Sequence[int]) -> list[st
             lines.append(f"{contestant.name}: {more} further episodes that not all of the others played are left out.")
         if contestant.stopped_when_decided:
             lines.append(
-                f"{contestant.name}: its evaluation stopped when it was decided ({contestant.source}), so that its number "
-                "of episodes was not planned; intervals and p values hold their level at planned numbers only."
+                f"{contestant.name}: its evaluation stopped when it was decided ({contestant.source}), so that its "
+                "number of episodes was not planned; intervals and p values hold their level at planned numbers only."
             )
     return lines

@@ -43,6 +43,11 @@ class Contestant:
     stopped_when_decided: bool
     episodes: Mapping[int, EpisodeResult]
 
+    @property
+    def place(self) -> str:
+        """Its name with its folder, for messages."""
+        return self.name if self.source in self.name else f"{self.name} ({self.source})"
+
     def results(self, seeds: Sequence[int]) -> list[EpisodeResult]:
         """Return the results of `seeds`, in their order."""
         return [self.episodes[seed] for seed in seeds]
@@ -153,7 +158,7 @@ def common_seeds(contestants: Sequence[Contestant]) -> list[int]:
 
 
 def _require_alike(first: Contestant, other: Contestant) -> None:
-    here, there = f"{first.name} ({first.source})", f"{other.name} ({other.source})"
+    here, there = first.place, other.place
     again = "evaluate both alike"
     if first.env_id != other.env_id:
         raise NotComparableError(f"{here} was played on {first.env_id}, {there} on {other.env_id}: {again}")

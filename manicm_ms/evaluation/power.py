@@ -15,7 +15,7 @@ from manicm_ms.evaluation.intervals import CONFIDENCE
 
 POWER = 0.8
 """Chance with which a number of pairs "would do"."""
-MOST_PAIRS = 10_000_000
+MOST_PAIRS = 1_000_000
 """Numbers of pairs of a planned comparison are not told beyond it."""
 MOST_PLAYED = 20_000
 """Nor those of a comparison that stops by itself beyond this one: they are simulated."""

@@ -76,12 +76,12 @@ def sentence(first: str, second: str, found: StateComparison, verdict: Verdict, 
     if verdict.word == UNDERPOWERED:
         settled = f"{counted(found.n, 'start state')} cannot tell {second} from {first}: {numbers}."
         return f"{settled} {needed_sentence(found, verdict.needed, second, margin)}".strip()
-    why = f"McNemar's exact test{'' if tests == 1 else f', corrected for {tests} comparisons'}"
+    test = f"McNemar's exact test{'' if tests == 1 else f' corrected for {tests} comparisons'}"
     if verdict.word == BETTER:
-        return f"{second} is better than {first}: {numbers} ({why})."
+        return f"{second} is better than {first} by {test}: {numbers}."
     if verdict.word == WORSE:
         mild = f", though by less than {points}" if verdict.within_margin else ""
-        return f"{second} is worse than {first}{mild}: {numbers} ({why})."
+        return f"{second} is worse than {first} by {test}{mild}: {numbers}."
     return f"{second} is not worse than {first} by more than {points}: {numbers}."
 
 
@@ -101,5 +101,5 @@ def needed_sentence(found: StateComparison, needed: NeededPairs | None, second: 
         supposed = f"If both are equally good and differ on as many start states as here ({discordant:.0f} %)"
     else:
         supposed = "Equally good policies would have shown it by now; if the rates are those observed"
-    many = "more than ten million episodes" if needed.pairs is None else f"about {needed.pairs} episodes"
+    many = "more than a million episodes" if needed.pairs is None else f"about {needed.pairs} episodes"
     return f"{supposed}, {many} of each would show that {second} {claim}, with a chance of {100 * POWER:g} %."
