@@ -102,9 +102,8 @@ def show_comparison(found: Mapping[str, Any], out: Path, console: Console) -> bo
 def _p_text(pair: Mapping[str, Any], tests: int) -> str:
     corrected = "" if tests == 1 else f", {pair['corrected_p']:.3g} corrected for {tests} comparisons"
     return (
-        f"Of {counted(pair['start_states'], 'start state')} only the first of the two succeeded on "
-        f"{pair['only_second']:g}, only the other on {pair['only_first']:g}; McNemar's exact p = "
-        f"{pair['mcnemar_p']:.3g}{corrected}."
+        f"{pair['second']} alone succeeded on {pair['only_second']:g} of {pair['start_states']}, {pair['first']} alone "
+        f"on {pair['only_first']:g}; McNemar's exact p = {pair['mcnemar_p']:.3g}{corrected}."
     )
 
 

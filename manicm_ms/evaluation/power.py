@@ -111,18 +111,16 @@ def needed_pairs(b: float, c: float, n: int, margin: float) -> NeededPairs:
     """
     require_margin(margin)
     each = (b + c) / n / 2
-    equal = _least_pairs(lambda m: chance_of_not_worse(m, each, each, margin))
+    equal = least_pairs(lambda m: chance_of_not_worse(m, each, each, margin))
     if equal is None or equal > n:
         return NeededPairs(equal, "not worse", EQUAL)
     b_rate, c_rate = b / n, c / n
     if b_rate - c_rate > -margin:
-        return NeededPairs(
-            _least_pairs(lambda m: chance_of_not_worse(m, b_rate, c_rate, margin)), "not worse", OBSERVED
-        )
-    return NeededPairs(_least_pairs(lambda m: chance_of_worse(m, b_rate, c_rate)), "worse", OBSERVED)
+        return NeededPairs(least_pairs(lambda m: chance_of_not_worse(m, b_rate, c_rate, margin)), "not worse", OBSERVED)
+    return NeededPairs(least_pairs(lambda m: chance_of_worse(m, b_rate, c_rate)), "worse", OBSERVED)
 
 
-def _least_pairs(chance: Callable[[int], float]) -> int | None:
+def least_pairs(chance: Callable[[int], float]) -> int | None:
     """Return the least number of pairs with a chance of `POWER`, but for the steps of counts that are whole."""
     high = 1
     while chance(high) < POWER:
