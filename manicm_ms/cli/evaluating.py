@@ -73,7 +73,7 @@ def evaluate_command(
         checkpoints, env, episodes, seed, out, num_envs=num_envs, backend=backend,
         device=device, control=control, videos=videos, threads=threads, realism=realism,
         camera=camera, obs_preset=obs_preset, allow_seen_seeds=allow_seen_seeds, to_the_end=to_the_end,
-        until_decided=_stopping_rule(until_decided, margin), policies=policy, colors=colors,
+        rule=_stopping_rule(until_decided, margin), policies=policy, colors=colors,
         command=this_command(), console=console,
     )  # fmt: skip
     return 0 if show(results, out, console) else 1

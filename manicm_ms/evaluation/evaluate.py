@@ -50,7 +50,7 @@ def evaluate(
     obs_preset: str = OBS_PRESET,
     allow_seen_seeds: bool = False,
     to_the_end: bool = True,
-    until_decided: StoppingRule | None = None,
+    rule: StoppingRule | None = None,
     policies: Sequence[str] = (),
     colors: bool = False,
     command: str | None = None,
@@ -58,7 +58,6 @@ def evaluate(
 ) -> dict[str, Any]:
     """Evaluate checkpoints on the same `episodes` held-out seeds and write results.json, report.md and report.html.
 
-    Beside them lie `eval_info.json` in LeRobot's layout and `episodes.jsonl`, a line for each episode.
     The same call goes on where an earlier one was stopped: finished episodes are on disk and are not played again.
 
     Args:
@@ -79,8 +78,7 @@ def evaluate(
         obs_preset: as in `make_vec`; the one of the demonstrations that the policies learnt from.
         allow_seen_seeds: evaluate on seeds of a checkpoint's own demonstrations and say so; refused otherwise.
         to_the_end: play on after a success that is certain, so that success at the end is known; False saves time.
-        until_decided: stop as soon as it is decided whether the last policy is worse than the first by more than the
-            rule's margin; `episodes` is then the largest number.
+        rule: when to stop before the last seed; None plays them all.
         policies: FILE.py:FUNCTION of each policy of the user's own, behind the checkpoints; see `UserPolicy`.
         colors: give policies of the user's own coloured clouds; beside checkpoints they get the first one's clouds.
         command: the command line to print in the report; None writes the equivalent of this call.
@@ -101,10 +99,9 @@ def evaluate(
     device = str(resolve_device(device))
     offered = SimulatorConfig(obs_preset=obs_preset, colors=colors).specialise(entry.spec)
     evaluated = _policies(checkpoints, policies, device, control, offered, () if allow_seen_seeds else seeds)
-    rule, console = until_decided, console or Console()
-    identity = identity_of(protocol, evaluated, env, device) | ({} if rule is None else rule.identity())
+    identity = identity_of(protocol, evaluated, env, device, rule)
     command = command or command_of(checkpoints, policies, env, episodes, seed, out, allow_seen_seeds, to_the_end, rule)
-    return evaluate_policies(evaluated, protocol, env_maker(env), out, identity, command, console, rule)
+    return evaluate_policies(evaluated, protocol, env_maker(env), out, identity, command, console or Console(), rule)
 
 
 def _policies(

@@ -17,7 +17,11 @@ if TYPE_CHECKING:
 
 
 def identity_of(
-    protocol: Protocol, policies: Sequence[EvaluatedPolicy], env: EnvRequest, device: str
+    protocol: Protocol,
+    policies: Sequence[EvaluatedPolicy],
+    env: EnvRequest,
+    device: str,
+    rule: StoppingRule | None = None,
 ) -> dict[str, Any]:
     """Return what identifies an evaluation in its folder: an interrupted one goes on where all of it is the same."""
     return {
@@ -28,6 +32,7 @@ def identity_of(
         "device": device,
         "policies": [[c.name, _place(i, c), c.digest] for i, c in enumerate(policies)],
         **requested_realism(protocol.realism, env.camera_model),
+        **({} if rule is None else rule.identity()),
         **({} if env.obs_preset == OBS_PRESET else {"obs_preset": env.obs_preset}),
     }
 
