@@ -70,6 +70,13 @@ class SpecMismatchError(ManicmError):
     """A data set, checkpoint or environment whose specs do not fit each other."""
 
 
+class NotComparableError(ManicmError):
+    """Policies that were not played in the same environment from the same start states."""
+
+    def __init__(self, difference: str) -> None:
+        super().__init__(f"not comparable: {difference}")
+
+
 class StoreError(ManicmError):
     """A demonstration store that is missing, broken, locked or of another origin."""
 

@@ -13,14 +13,14 @@ from collections.abc import Callable, Sequence
 import tyro
 
 from manicm_ms import signals
-from manicm_ms.cli import benchmarking, cameras, checking, demonstrations, evaluating, reporting
+from manicm_ms.cli import benchmarking, cameras, checking, comparing, demonstrations, evaluating, reporting
 from manicm_ms.cli.counts import checked
 from manicm_ms.cli.messages import PROGRAM, explain, report_error, warnings_in_one_line
 from manicm_ms.errors import ManicmError, UnknownNameError
 
 Command = Callable[..., int | None]
 USER_ERROR, INTERRUPTED = 2, 130
-_RESUMABLE = ("collect", "train", "distill", "evaluate", "benchmark")
+_RESUMABLE = ("collect", "train", "distill", "evaluate", "compare", "benchmark")
 
 PLAIN: dict[str, Command] = {
     "list": checking.list_command,
@@ -30,6 +30,7 @@ PLAIN: dict[str, Command] = {
     "inspect": demonstrations.inspect_command,
     "convert": demonstrations.convert_command,
     "evaluate": evaluating.evaluate_command,
+    "compare": comparing.compare_command,
     "report": reporting.report_command,
     "benchmark": benchmarking.benchmark_command,
     "calibrate": cameras.calibrate_command,

@@ -3,15 +3,18 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from rich.console import Console
 
 from manicm_ms.errors import ConfigError
+from manicm_ms.evaluation.decided import StoppingRule, seal
+from manicm_ms.evaluation.eval_info import write_exports
 from manicm_ms.evaluation.latency import stored_or_measured
 from manicm_ms.evaluation.origins import remarks
-from manicm_ms.evaluation.play import EnvMaker, env_maker, play
+from manicm_ms.evaluation.play import EnvMaker, Played, env_maker, play, play_in_blocks
 from manicm_ms.evaluation.policies import load_policies, require_playable, with_users
 from manicm_ms.evaluation.protocol import CLEAN, OBS_PRESET, EvaluatedPolicy, Protocol
 from manicm_ms.evaluation.records import claimed_folder
@@ -47,6 +50,7 @@ def evaluate(
     obs_preset: str = OBS_PRESET,
     allow_seen_seeds: bool = False,
     to_the_end: bool = True,
+    rule: StoppingRule | None = None,
     policies: Sequence[str] = (),
     colors: bool = False,
     command: str | None = None,
@@ -74,6 +78,7 @@ def evaluate(
         obs_preset: as in `make_vec`; the one of the demonstrations that the policies learnt from.
         allow_seen_seeds: evaluate on seeds of a checkpoint's own demonstrations and say so; refused otherwise.
         to_the_end: play on after a success that is certain, so that success at the end is known; False saves time.
+        rule: when to stop before the last seed; None plays them all.
         policies: FILE.py:FUNCTION of each policy of the user's own, behind the checkpoints; see `UserPolicy`.
         colors: give policies of the user's own coloured clouds; beside checkpoints they get the first one's clouds.
         command: the command line to print in the report; None writes the equivalent of this call.
@@ -94,9 +99,9 @@ def evaluate(
     device = str(resolve_device(device))
     offered = SimulatorConfig(obs_preset=obs_preset, colors=colors).specialise(entry.spec)
     evaluated = _policies(checkpoints, policies, device, control, offered, () if allow_seen_seeds else seeds)
-    identity = identity_of(protocol, evaluated, env, device)
-    command = command or command_of(checkpoints, policies, env, episodes, seed, out, allow_seen_seeds, to_the_end)
-    return evaluate_policies(evaluated, protocol, env_maker(env), out, identity, command, console or Console())
+    identity = identity_of(protocol, evaluated, env, device, rule)
+    command = command or command_of(checkpoints, policies, env, episodes, seed, out, allow_seen_seeds, to_the_end, rule)
+    return evaluate_policies(evaluated, protocol, env_maker(env), out, identity, command, console or Console(), rule)
 
 
 def _policies(
@@ -130,6 +135,7 @@ def evaluate_policies(
     request: Mapping[str, Any],
     command: str,
     console: Console,
+    rule: StoppingRule | None = None,
 ) -> dict[str, Any]:
     """Evaluate loaded policies; see `evaluate`, which loads them and makes real environments.
 
@@ -141,8 +147,14 @@ def evaluate_policies(
         request: plain JSON values that identify this evaluation in `out`.
         command: the command line that reproduces it.
         console: where progress is shown.
+        rule: when to stop before the last seed.
     """
+    if rule is not None:
+        rule.require_possible(policies, protocol)
     with claimed_folder(out, request):
+        plan = {} if rule is None else rule.plan(protocol, policies, request)
+        if rule is not None:
+            seal(plan, out)
         for remark in remarks(policies, protocol.env_id, protocol.seeds):
             console.print(remark, style="yellow", highlight=False, markup=False, soft_wrap=True)
         with working(console, "time the decisions"):
@@ -150,8 +162,12 @@ def evaluate_policies(
                 {p.name: p.policy for p in policies}, out / "latency.json",
                 repetitions=protocol.repetitions, threads=protocol.threads,
             )  # fmt: skip
-        played = play(policies, protocol, envs, out, console)
+        played = _play(policies, protocol, envs, out, console, rule)
+        protocol = replace(protocol, seeds=played.seeds)
         results = compile_results(policies, protocol, played, latencies, command, envs.conditions)
+        if rule is not None:
+            episodes = played.by_preset[protocol.realism[0]]
+            results["until_decided"] = rule.outcome(plan, episodes[policies[0].name], episodes[policies[-1].name])
         _write(results, out)  # before filming, which may fail or be stopped
         main, fps = played.by_preset[protocol.realism[0]], played.spec.action.control_hz
         results["videos"] = film_pair(policies, protocol, envs, out, main, fps, console)
@@ -159,6 +175,23 @@ def evaluate_policies(
     return results
 
 
+def _play(
+    policies: Sequence[EvaluatedPolicy],
+    protocol: Protocol,
+    envs: EnvMaker,
+    out: Path,
+    console: Console,
+    rule: StoppingRule | None,
+) -> Played:
+    if rule is None:
+        return play(policies, protocol, envs, out, console)
+    first, last = policies[0].name, policies[-1].name
+    return play_in_blocks(
+        policies, protocol, envs, out, console, rule.block, lambda r: rule.decided(r[first], r[last])
+    )  # fmt: skip
+
+
 def _write(results: Mapping[str, Any], out: Path) -> None:
     write_json(out / "results.json", results)
+    write_exports(results, out)
     write_report(results, out)

@@ -21,18 +21,19 @@ _NEED_BYTES = 50_000_000
 
 
 @contextmanager
-def claimed_folder(out: Path, request: Mapping[str, Any]) -> Iterator[Path]:
+def claimed_folder(out: Path, request: Mapping[str, Any], kind: str = "evaluation") -> Iterator[Path]:
     """Yield `out`, locked for this process, where it is fresh or holds the records of the same `request`.
 
     Args:
         out: the folder; made where it does not exist.
         request: plain JSON values that fix the results; compared with those of an earlier call.
+        kind: what a request is called in a message.
 
     Raises:
         OutputExistsError: a folder that holds something else, or that another process writes.
         NoSpaceError: too little room on its disk.
     """
-    require_same_request(out, request)
+    require_same_request(out, request, kind=kind)
     require_free_space(out, _NEED_BYTES)
     out.mkdir(parents=True, exist_ok=True)
 
@@ -40,7 +41,7 @@ def claimed_folder(out: Path, request: Mapping[str, Any]) -> Iterator[Path]:
         return OutputExistsError(f"{out} is being written by process {holder}: wait for it or choose another --out")
 
     with exclusive_lock(out / LOCK_FILE, refuse):
-        require_same_request(out, request)
+        require_same_request(out, request, kind=kind)
         write_json(out / RUN_FILE, dict(request))
         yield out
 

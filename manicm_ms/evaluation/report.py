@@ -9,6 +9,7 @@ from typing import Any
 
 import jinja2
 
+from manicm_ms.evaluation.decided import decision_sentences
 from manicm_ms.evaluation.plots import PAPER_LATENCY_MS, latency_plot, success_plot
 from manicm_ms.evaluation.results import INTERVALS
 from manicm_ms.evaluation.text import (
@@ -60,7 +61,11 @@ def _context(results: Mapping[str, Any]) -> dict[str, Any]:
         "title": episodes_title(results),
         "remarks": results.get("remarks", []),
         "intervals": results.get("intervals", INTERVALS),
-        "sentences": [*filter(None, [realism_sentence(results)]), *paired_sentences(results)],
+        "sentences": [
+            *filter(None, [realism_sentence(results)]),
+            *decision_sentences(results),
+            *paired_sentences(results),
+        ],
         "realism_headers": realism_headers(results) if "realism" in results else (),
         "realism_rows": realism_rows(results),
         "crashes": crash_lines(results),

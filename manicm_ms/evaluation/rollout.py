@@ -4,9 +4,10 @@ from __future__ import annotations
 
 import base64
 import contextlib
+import hashlib
 from collections import deque
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
@@ -14,13 +15,15 @@ import torch
 
 from manicm_ms.errors import BackendError, ConfigError
 from manicm_ms.evaluation.decisions import Decider, Decisions
-from manicm_ms.spec import ChunkSpec, require_compatible
+from manicm_ms.spec import STATE, ChunkSpec, require_compatible
 
 if TYPE_CHECKING:
     from manicm_ms.envs.vector import VecEnv
 
 MAX_RESTARTS = 3
 """Restarts of a dead env in a row, without an episode that ended by itself, before the rollout gives up."""
+POLICY_FAULT = "the policy's action"
+"""How the reason of an episode begins that its policy ended, by an action that is not finite; others are crashes."""
 
 
 @dataclass(frozen=True)
@@ -36,6 +39,7 @@ class EpisodeResult:
         crashed: why the episode could not be played to its end, None where it was.
         success_once: whether it succeeded at some step; None in records of earlier versions.
         success_at_end: whether it succeeded at its last step; None where it was not played to its end.
+        start_state: digest of the first state, see `start_digest`; None in records of earlier versions.
         actions: (decisions, Ta, Da) float32, the actions commanded; with the seed they replay the episode.
     """
 
@@ -47,6 +51,7 @@ class EpisodeResult:
     crashed: str | None = None
     success_once: bool | None = None
     success_at_end: bool | None = None
+    start_state: str | None = None
     actions: np.ndarray = field(default_factory=lambda: np.zeros((0, 1, 1), np.float32), compare=False, repr=False)
 
     def to_record(self) -> dict[str, Any]:
@@ -65,12 +70,23 @@ class EpisodeResult:
             "decisions": self.decisions,
             "return": self.total_return,
             "crashed": self.crashed,
+            "start_state": self.start_state,
         }
+
+    @property
+    def infrastructure_crashed(self) -> bool:
+        """Whether something else than its policy ended the episode: then it says nothing about the policy."""
+        return self.crashed is not None and not self.crashed.startswith(POLICY_FAULT)
 
     @classmethod
     def from_record(cls, record: Mapping[str, Any]) -> EpisodeResult:
         """Build a result from what `to_record` returned."""
         flat = np.frombuffer(base64.b64decode(record["actions"]), dtype="<f4").astype(np.float32)
+        return replace(cls.from_summary(record), actions=flat.reshape(record["actions_shape"]))
+
+    @classmethod
+    def from_summary(cls, record: Mapping[str, Any]) -> EpisodeResult:
+        """Build a result without its actions from what `summary` returned, in this or an earlier version."""
         return cls(
             seed=int(record["seed"]),
             success=bool(record["success"]),
@@ -80,7 +96,7 @@ class EpisodeResult:
             crashed=record["crashed"],
             success_once=record.get("success_once"),
             success_at_end=record.get("success_at_end"),
-            actions=flat.reshape(record["actions_shape"]),
+            start_state=record.get("start_state"),
         )
 
 
@@ -121,6 +137,23 @@ def require_chunk(vec_env: VecEnv, chunk: ChunkSpec) -> None:
         )
 
 
+def start_digest(obs: Mapping[str, torch.Tensor], row: int) -> str | None:
+    """Return what tells the state in which a row stands from others: 16 hex digits of the SHA-256 of its float32 bytes.
+
+    None where the env does not give its privileged state. It does not depend on what a policy reads of the scene, so
+    that two policies meet on the same start state where, and only where, their digests are equal. Two machines may
+    differ in a last bit and so in the digest.
+
+    Args:
+        obs: key -> (N, To, ...), just after a reset.
+        row: which of the N.
+    """
+    if STATE not in obs or obs[STATE].shape[-1] == 0:
+        return None
+    state = np.ascontiguousarray(_numpy(obs[STATE][row, -1]), dtype="<f4")
+    return hashlib.sha256(state.tobytes()).hexdigest()[:16]
+
+
 def rollout(
     vec_env: VecEnv | RestartableEnv,
     policy: Decider,
@@ -151,7 +184,8 @@ def rollout(
     another batch size, at which matrix products round differently by about 1e-6.
 
     Args:
-        vec_env: env with N rows, made with `chunk=policy.chunk`.
+        vec_env: env with N rows, made with `chunk=policy.chunk`. Where it gives the privileged state, results hold
+            its digest, and a policy that does not name the state among its `keys` does not see it.
         policy: decides; it stays on its device and is put in evaluation mode.
         seeds: distinct non-negative integers.
         on_episode: called with each result as soon as it is known, in order of completion.
@@ -180,6 +214,7 @@ class _Episode:
 
     def __init__(self, seed: int) -> None:
         self.seed = seed
+        self.start_state: str | None = None
         self.steps = 0
         self.total_return = 0.0
         self.actions: list[np.ndarray] = []  # each (Ta, Da)
@@ -188,7 +223,7 @@ class _Episode:
         actions = np.stack(self.actions) if self.actions else np.zeros((0, 1, 1), np.float32)
         return EpisodeResult(
             self.seed, outcome.success, self.steps, len(self.actions), self.total_return, outcome.crashed,
-            outcome.success_once, outcome.success_at_end, actions,
+            outcome.success_once, outcome.success_at_end, self.start_state, actions,
         )  # fmt: skip
 
 
@@ -221,6 +256,8 @@ class _Rollout:
         self.decisions = Decisions(policy, self.env.num_envs)
         self.obs: Mapping[str, torch.Tensor] | None = None  # None until the env's first reset
         self.restarts = 0
+        # The privileged state is for the record alone, unless the policy reads it or does not say what it reads.
+        self.hidden = {STATE} - set(getattr(policy, "keys", (STATE,)))
 
     def run(self) -> dict[int, EpisodeResult]:
         """Play all pending seeds; return seed -> result."""
@@ -247,14 +284,19 @@ class _Rollout:
         self.obs, info = self.env.reset(seed=seeds, options={"reset_mask": mask})
         self.decisions.restart(np.flatnonzero(mask).tolist())
         for i in np.flatnonzero(fresh).tolist():
+            episode = self.rows[i]
+            assert episode is not None
             if (error := info["error"][i]) is not None:
                 self._end(i, _Outcome(crashed=error))
+            else:
+                episode.start_state = start_digest(self.obs, i)
 
     def _decide(self) -> torch.Tensor:
         """Return actions (N, Ta, Da); end the episodes of rows whose action is not finite."""
         assert self.obs is not None
         asked = [None if e is None else (e.seed, len(e.actions)) for e in self.rows]
-        actions = self.decisions.actions(self.obs, asked)
+        seen = {key: values for key, values in self.obs.items() if key not in self.hidden}
+        actions = self.decisions.actions(seen, asked)
         finite = torch.isfinite(actions).flatten(1).all(1).cpu()
         actions = torch.where(finite.to(actions.device)[:, None, None], actions, torch.zeros_like(actions))
         played = actions.float().cpu().numpy()
@@ -264,7 +306,7 @@ class _Rollout:
             if finite[i]:
                 episode.actions.append(played[i].copy())
             else:
-                self._end(i, _Outcome(crashed=f"the policy's action {len(episode.actions)} is not finite"))
+                self._end(i, _Outcome(crashed=f"{POLICY_FAULT} {len(episode.actions)} is not finite"))
         return actions.to(self.env.device)
 
     def _play(self, actions: torch.Tensor) -> None:

@@ -9,6 +9,7 @@ from typing import Any
 from rich.console import Console
 from rich.table import Table
 
+from manicm_ms.evaluation.decided import decision_sentences
 from manicm_ms.evaluation.results import without_rate
 from manicm_ms.evaluation.text import (
     HEADERS,
@@ -37,7 +38,7 @@ def show(results: Mapping[str, Any], out: Path, console: Console) -> bool:
 def screen_lines(results: Mapping[str, Any]) -> list[str]:
     """Return what the command line prints below its tables."""
     lines = [*results["remarks"], once_at_end_sentence(results)]
-    return [*lines, *paired_sentences(results), *crash_lines(results)]
+    return [*lines, *paired_sentences(results), *decision_sentences(results), *crash_lines(results)]
 
 
 def summary_table(results: Mapping[str, Any]) -> Table:

@@ -7,6 +7,7 @@ from typing import NamedTuple
 
 import numpy as np
 from statsmodels.stats.contingency_tables import mcnemar
+from statsmodels.stats.multitest import multipletests
 
 from manicm_ms.errors import ConfigError
 from manicm_ms.evaluation.intervals import Interval, PairedCounts, paired_difference_interval, rate_interval
@@ -75,6 +76,17 @@ def compare_paired(first: Sequence[bool] | np.ndarray, second: Sequence[bool] | 
     if counts.n == 0:
         raise ConfigError("a paired comparison needs at least one seed")
     return PairedComparison(counts, counts.difference, paired_difference_interval(counts), mcnemar_exact(counts))
+
+
+def holm(p_values: Sequence[float]) -> list[float]:
+    """Return p values corrected for being printed together, in their order; nothing for nothing.
+
+    Source: S. Holm, "A simple sequentially rejective multiple test procedure", Scandinavian Journal of Statistics 6
+    (1979) 65-70.
+    """
+    if len(p_values) == 0:
+        return []
+    return [float(p) for p in multipletests(list(p_values), method="holm")[1]]
 
 
 def mean_of_highest(rates: Sequence[float], count: int = 5) -> float:

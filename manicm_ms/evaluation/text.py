@@ -45,8 +45,8 @@ def _row(policy: Mapping[str, Any]) -> Row:
         nfe=NOTHING if policy["nfe"] is None else str(policy["nfe"]),
         success=success_text(policy),
         interval=interval_text(policy["ci95"]),
-        once=_count_text(policy.get("success_once")),
-        at_end=_count_text(policy.get("success_at_end")),
+        once=count_text(policy.get("success_once")),
+        at_end=count_text(policy.get("success_at_end")),
         crashed=str(policy["crashed"]),
         median=format_ms(policy["latency_ms"]["median"]),
         p95=format_ms(policy["latency_ms"]["p95"]),
@@ -65,7 +65,8 @@ def interval_text(ci95: Sequence[float] | None) -> str:
     return NOTHING if ci95 is None else f"{100 * ci95[0]:.1f} to {100 * ci95[1]:.1f} %"
 
 
-def _count_text(entry: Mapping[str, Any] | None) -> str:
+def count_text(entry: Mapping[str, Any] | None) -> str:
+    """Return successes of episodes; a dash where they are not known."""
     return NOTHING if entry is None else f"{entry['successes']}/{entry['n']}"
 
 
@@ -147,7 +148,7 @@ def _realism_row(row: Mapping[str, Any]) -> RealismRow:
         least, most = (100 * bound for bound in pair["difference_ci95"])
         difference = f"{100 * pair['difference']:+.1f} points ({least:+.1f} to {most:+.1f})"
         p = f"{pair['mcnemar_p']:.3g}"
-    both = f"{_count_text(row.get('success_once'))}, {_count_text(row.get('success_at_end'))}"
+    both = f"{count_text(row.get('success_once'))}, {count_text(row.get('success_at_end'))}"
     interval = interval_text(row["ci95"])
     return RealismRow(row["preset"], row["policy"], success_text(row), interval, both, difference, p)
 

@@ -110,7 +110,9 @@ class PointMass(gym.vector.VectorEnv):
         cloud[..., :2] = pos[:, :, None]
         if not self.chunk:
             pos, cloud = pos[:, -1], cloud[:, -1]
-        return {"agent_pos": torch.from_numpy(pos), "point_cloud": torch.from_numpy(cloud)}
+        # The privileged state is for the record of the start: nothing of a policy may depend on it.
+        obs = {"agent_pos": pos, "point_cloud": cloud, "state": pos.copy()}
+        return {key: torch.from_numpy(values) for key, values in obs.items()}
 
     def _info(self):
         return {

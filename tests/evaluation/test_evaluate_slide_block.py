@@ -10,7 +10,8 @@ from rich.console import Console
 
 from manicm_ms.envs.env_request import EnvRequest
 from manicm_ms.envs.simulator import ENVS
-from manicm_ms.errors import CheckpointError, ConfigError, SpecMismatchError, UnknownNameError
+from manicm_ms.errors import CheckpointError, ConfigError, NotComparableError, SpecMismatchError, UnknownNameError
+from manicm_ms.evaluation.compare import Playing, compare
 from manicm_ms.evaluation.evaluate import evaluate
 from manicm_ms.evaluation.policies import checkpoint_digest, load_policies
 from manicm_ms.evaluation.protocol import Protocol
@@ -139,4 +140,40 @@ def test_bad_input_is_refused_before_anything_is_written(pair, tmp_path):
     save_checkpoint(make_policy("simple_dp3", stranger, ChunkSpec(2, 4, 3), CONFIG, seed=0), tmp_path / "stranger", {})
     with pytest.raises(SpecMismatchError, match="control_hz"):
         run([tmp_path / "stranger"], out)
+    assert not out.exists()
+
+
+def test_checkpoints_are_compared_once_evaluated_on_the_same_start_states_and_go_on(pair, tmp_path):
+    out, playing = tmp_path / "compare", Playing(ENV, episodes=1, num_envs=1, backend="cpu")
+    found = compare(pair, out, playing, console=Console(file=io.StringIO(), width=120))
+    assert [(p["name"], p["n"]) for p in found["policies"]] == [("teacher", 1), ("student", 1)]
+    assert (found["start_states"], found["seeds"], found["pairs"][0]["verdict"]) == (
+        "digest",
+        [100_000],
+        "underpowered",
+    )
+    logs = sorted((out / "evaluations").glob("*/episodes/*.jsonl"))
+    before = [log.read_bytes() for log in logs]
+    assert compare(pair, out, playing, console=Console(file=io.StringIO())) == found
+    assert [log.read_bytes() for log in logs] == before, "nothing is played again"
+    both = compare([out / "evaluations" / "teacher", pair[1]], tmp_path / "both", playing, console=Console(quiet=True))
+    assert [p["name"] for p in both["policies"]] == ["teacher", "student"]
+
+
+def test_checkpoints_that_cannot_be_compared_are_refused_before_anything_is_written(pair, tmp_path):
+    out = tmp_path / "compare"
+    with pytest.raises(ConfigError, match="is a checkpoint and has to be played: add --env"):
+        compare(pair, out)
+    spec = dataclasses.replace(ENVS.get(ENV).spec, env_id="ur3e/stack-cube")
+    save_checkpoint(make_policy("simple_dp3", spec, ChunkSpec(2, 4, 3), CONFIG, seed=0), tmp_path / "other", {})
+    with pytest.raises(
+        NotComparableError, match=r"teacher was trained for ur3e/slide-block, .*other for ur3e/stack-cube"
+    ):
+        compare([pair[0], tmp_path / "other"], out, Playing(ENV))
+    with pytest.raises(ConfigError, match="one realism preset, got clean, d435i"):
+        compare(pair, out, Playing(ENV, realism="clean,d435i"))
+    with pytest.raises(ConfigError, match="are those of the demonstrations"):
+        compare(pair, out, Playing(ENV, seed=0))
+    with pytest.raises(ConfigError, match="choose a smaller --seed"):
+        compare(pair, out, Playing(ENV, seed=2**40))
     assert not out.exists()
