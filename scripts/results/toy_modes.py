@@ -245,22 +245,26 @@ PAGE = """# Which one-step methods keep two modes: two-dimensional actions
 
 Share of samples on a mode / share on the rarer mode (0.5 at best) / energy distance to fresh data (0 at best).
 
-**Both modes are kept** by the student, by MeanFlow with each of its targets, by UCA-Flow's objective and by the mixture of Gaussians, whose form is
-that of the data. The average velocities leave more samples between the modes than the diffusion of ten steps at the same budget, and about as many as its student.
-**Neither is met** by the diffusion's network once, which answers with the mean.
+**Both modes are kept** by the student, by MeanFlow with each of its targets, by UCA-Flow's objective and by the mixture
+of Gaussians, whose form is that of the data. The average velocities leave more samples between the modes than the
+diffusion's ten steps at the same budget; their energy distances are about those of the student.
+**Neither mode is met** by the diffusion's network once: it answers with the mean.
 
-**Drift is a matter of its start.** Here it ends where it began: all samples on the mean of the data. That is a rest of the published
-field, not of an implementation: with one demonstration y for each observation the force on a sample is P sum_j N_j (y - a_j), drawn to y less its neighbours; where all samples
-lie together at the mean of the data, and the data beyond the reach of every temperature (P is its floor), its mean over y is 0. Whether chance
-leads out of there before the learning rate falls depends on batch and seed:
+**Drift keeps both, more sharply than the other networks, or answers with the mean: chance decides.** A collapsed
+generator is a rest of the published field. With one demonstration y for each observation the force on sample i is
+P_i sum_j N_ij (y - a_j): towards y, less where its neighbours a_j lie. Where all samples lie together at the mean of
+the data, and the data beyond the reach of every temperature (P_i is its floor), its mean over y is 0. Whether a
+training finds out of there before its learning rate falls differs from seed to seed and from batch to batch:
 
 {starts}
 
-So look at the spread of its samples before believing a rate of its.
+So look at the spread of its samples before believing a rate of drift, and train more than one seed.
 
-`python scripts/results/toy_modes.py`: {steps} steps of batch {batch} for each method above, the student's after its teacher's; {drift_steps} steps for
-each cell of the second table. One small MLP for all (the mixture: its own of the same width), the package's heads, objectives and optimiser, learning rate 1e-3 (student
-5e-4) with warm-up and cosine, averaged weights. {samples} samples a row, the same noise in each. {seconds:.0f} s of wall time with one thread, torch {torch}.
+`python scripts/results/toy_modes.py`: {steps} steps of batch {batch} for each method of the first table, the student's
+after its teacher's; {drift_steps} steps for each cell of the second. One small MLP for all (the mixture has its own, of
+the same width), the package's heads, objectives and optimiser, learning rate 1e-3 (student 5e-4) with warm-up and
+cosine, averaged weights. {samples} samples a row, the same noise in each. {seconds:.0f} s of wall time with one thread
+on a machine busy with other work, torch {torch}.
 """
 
 if __name__ == "__main__":
