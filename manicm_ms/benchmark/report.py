@@ -33,7 +33,7 @@ class TextTable(NamedTuple):
 
     title: str
     headers: tuple[str, ...]
-    rows: list[tuple[str, ...]]
+    rows: Sequence[tuple[str, ...]]
 
 
 def main_table(results: Mapping[str, Any]) -> TextTable:

@@ -6,7 +6,7 @@ import json
 import sys
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 
@@ -23,7 +23,12 @@ REPO = Path(__file__).resolve().parents[2]
 PRINTED: Mapping[str, Any] = json.loads((REPO / "docs" / "results" / "data" / "manicm_paper.json").read_text())
 MISSING = "\u2013"
 LEGEND = f"{MISSING}: not run here, or not printed in the paper; never a zero."
-TABLES = ("main", "ddim", "prediction", "real")
+TABLES: tuple[Literal["main"], Literal["ddim"], Literal["prediction"], Literal["real"]] = (
+    "main",
+    "ddim",
+    "prediction",
+    "real",
+)
 EPSILON = "[head.prediction_type=epsilon]"
 CONTROL = "one_step"
 _SAME = ("preset", "demos", "colors", "obs_preset", "episodes", "eval_seed")
