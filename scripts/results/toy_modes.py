@@ -246,8 +246,8 @@ PAGE = """# Which one-step methods keep two modes: two-dimensional actions
 Share of samples on a mode / share on the rarer mode (0.5 at best) / energy distance to fresh data (0 at best).
 
 **Both modes are kept** by the student, by MeanFlow with each of its targets, by UCA-Flow's objective and by the mixture
-of Gaussians, whose form is that of the data. The average velocities leave more samples between the modes than the
-diffusion's ten steps at the same budget; their energy distances are about those of the student.
+of Gaussians, whose form is that of the data. The average velocities put fewer samples on a mode than the diffusion's
+ten steps at the same budget, and share them less evenly; their energy distances are about those of the student.
 **Neither mode is met** by the diffusion's network once: it answers with the mean.
 
 **Drift keeps both, more sharply than the other networks, or answers with the mean: chance decides.** A collapsed
