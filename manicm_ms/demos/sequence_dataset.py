@@ -129,8 +129,8 @@ class JoinedFrames:
 def frames_of(store: DemoStore, key: str, most_bytes: int | None = None) -> Tensor | StoredFrames:
     """Return the committed frames of an observation, or of the actions, in the type that they are stored in.
 
-    Pictures and grids of more than `most_bytes` (None: `MOST_HELD_BYTES`) stay on the disk; what is scaled by its range is
-    held in memory.
+    Pictures and grids of more than `most_bytes` (None: `MOST_HELD_BYTES`) stay on the disk; what is scaled by its range
+    is held in memory.
     """
     field, count = FIELD_OF_OBS.get(key, key), store.num_frames
     most = MOST_HELD_BYTES if most_bytes is None else most_bytes
