@@ -120,6 +120,8 @@ def compare(
         "baseline": contestants[chosen].name,
         "margin": margin,
         "all_pairs": all_pairs,
+        "env_id": contestants[0].env_id,
+        "seeds": [playing.seeds[0], playing.seeds[-1]] if any(c.pending for c in contestants) else None,
     }
     with claimed_folder(out, request, "comparison"):
         played = [_played(contestant, playing, out, console) for contestant in contestants]
@@ -184,7 +186,7 @@ def _require_one_task(loaded: Sequence[EvaluatedPolicy]) -> None:
 
 def _played(contestant: Contestant, playing: Playing, out: Path, console: Console) -> Contestant:
     """Return the policy with its outcomes; one of a checkpoint is evaluated first."""
-    if contestant.source != contestant.checkpoint:
+    if not contestant.pending:
         return contestant
     folder = out / EVALUATIONS / slug(contestant.name)
     playing.evaluate(contestant.checkpoint, folder, console)

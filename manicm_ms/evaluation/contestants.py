@@ -23,7 +23,7 @@ class Contestant:
 
     Attributes:
         name: its name in the comparison.
-        source: folder of the evaluation that it was played in.
+        source: folder of the evaluation that it was played in; that of the checkpoint before it was played.
         role: as in the evaluation.
         checkpoint: where it was loaded from.
         identity: what tells it from other policies; None where the records do not hold it.
@@ -42,6 +42,11 @@ class Contestant:
     conditions: Mapping[str, Any]
     stopped_when_decided: bool
     episodes: Mapping[int, EpisodeResult]
+
+    @property
+    def pending(self) -> bool:
+        """Whether it is a checkpoint that is still to be played: its episodes hold no outcomes yet."""
+        return self.source == self.checkpoint
 
     @property
     def place(self) -> str:

@@ -12,12 +12,11 @@ from typing import Any
 from manicm_ms.errors import ConfigError, OutputExistsError
 from manicm_ms.evaluation.anytime import ALPHA, EACH_ALPHA, decide, difference_evidence, require_margin
 from manicm_ms.evaluation.pairs import differences, pair_up, without_repeats
-from manicm_ms.evaluation.power import LOOK, POWER, pairs_until_not_worse
+from manicm_ms.evaluation.power import LOOK, pairs_until_not_worse
 from manicm_ms.evaluation.protocol import EvaluatedPolicy, Protocol
 from manicm_ms.evaluation.rollout import EpisodeResult
 from manicm_ms.evaluation.verdicts import NOT_WORSE, UNDERPOWERED, WORSE
 from manicm_ms.paths import write_json
-from manicm_ms.wording import counted
 
 PLAN_FILE = "plan.json"
 _RULE = (
@@ -138,38 +137,3 @@ def seal(plan: Mapping[str, Any], out: Path) -> None:
 
 def _digest(fixed: Mapping[str, Any]) -> str:
     return hashlib.sha256(json.dumps(fixed, sort_keys=True, allow_nan=False).encode()).hexdigest()
-
-
-def decision_sentences(results: Mapping[str, Any]) -> list[str]:
-    """Return how an evaluation that stops when it is decided ended, in words; nothing for any other."""
-    found = results.get("until_decided")
-    if found is None:
-        return []
-    margin = f"{100 * found['plan']['margin']:g} points"
-    claim = {
-        NOT_WORSE: f"{found['second']} is not worse than {found['first']} by more than {margin}",
-        WORSE: f"{found['second']} is worse than {found['first']} by more than {margin}",
-        UNDERPOWERED: f"underpowered: whether {found['second']} is worse than {found['first']} by more than {margin} "
-        "is still open",
-    }[found["verdict"]]
-    lines = [
-        f"Stopped after {counted(found['pairs'], 'pair')}: {claim}. "
-        f"Capital of 'not worse' {found['capital_not_worse']:.3g}, of 'worse' {found['capital_worse']:.3g}; "
-        f"either needed {found['capital_needed']:g}."
-    ]
-    if found["verdict"] == UNDERPOWERED and found["pairs"]:
-        needed = found["pairs_that_would_do"]
-        many = "more than 20000 pairs" if needed is None else f"about {needed} pairs"
-        lines.append(
-            f"If both are equally good and part as often as here, {many} would do with a chance of {100 * POWER:g} %."
-        )
-    if found["left_out"] or found["repeats"]:
-        lines.append(
-            f"Left out of the decision: {counted(found['left_out'], 'pair')} with a crash, "
-            f"{counted(found['repeats'], 'repeat')} of a start state."
-        )
-    lines.append(
-        "The data decided the number of pairs: the decision above holds its level, the interval and the p value of the "
-        "paired difference hold theirs at a planned number only."
-    )
-    return lines

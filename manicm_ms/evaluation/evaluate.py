@@ -92,11 +92,10 @@ def evaluate(
 
     entry, seeds = ENVS.get(env_id), tuple(range(seed, seed + episodes))
     presets, rows = parse_presets(realism), _rows(num_envs, episodes)
-    where = resolve_backend(backend, entry)
+    where, device = resolve_backend(backend, entry), str(resolve_device(device))
     env = EnvRequest(env_id, where, colors=colors, realism=realism, camera=camera, obs_preset=obs_preset)
     env.require_offered()
     protocol = Protocol(env_id, seeds, rows, threads, repetitions, videos, presets, to_the_end, entry.seed_limit)
-    device = str(resolve_device(device))
     offered = SimulatorConfig(obs_preset=obs_preset, colors=colors).specialise(entry.spec)
     evaluated = _policies(checkpoints, policies, device, control, offered, () if allow_seen_seeds else seeds)
     identity = identity_of(protocol, evaluated, env, device, rule)

@@ -9,12 +9,12 @@ from typing import Any
 
 import jinja2
 
-from manicm_ms.evaluation.decided import decision_sentences
 from manicm_ms.evaluation.plots import PAPER_LATENCY_MS, latency_plot, success_plot
 from manicm_ms.evaluation.results import INTERVALS
 from manicm_ms.evaluation.text import (
     HEADERS,
     crash_lines,
+    decision_sentences,
     episodes_title,
     format_ms,
     paired_sentences,

@@ -9,12 +9,12 @@ from typing import Any
 from rich.console import Console
 from rich.table import Table
 
-from manicm_ms.evaluation.decided import decision_sentences
 from manicm_ms.evaluation.results import without_rate
 from manicm_ms.evaluation.text import (
     HEADERS,
     Row,
     crash_lines,
+    decision_sentences,
     once_at_end_sentence,
     paired_sentences,
     realism_headers,

@@ -5,7 +5,10 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from typing import Any, NamedTuple
 
+from manicm_ms.evaluation.power import MOST_PLAYED, POWER
 from manicm_ms.evaluation.results import INTERVALS, without_rate
+from manicm_ms.evaluation.verdicts import NOT_WORSE, UNDERPOWERED, WORSE
+from manicm_ms.wording import counted
 
 NOTHING = "-"
 
@@ -94,6 +97,41 @@ def paired_sentences(results: Mapping[str, Any]) -> list[str]:
     why = "" if None in evaluations else ": {} against {} network evaluations a decision".format(*evaluations)
     sentences.append(f"The policy {pair['second']} decides {first / second:.1f} times as fast as {pair['first']}{why}.")
     return sentences
+
+
+def decision_sentences(results: Mapping[str, Any]) -> list[str]:
+    """Return how an evaluation that stops when it is decided ended, in words; nothing for any other."""
+    found = results.get("until_decided")
+    if found is None:
+        return []
+    margin = f"{100 * found['plan']['margin']:g} points"
+    claim = {
+        NOT_WORSE: f"{found['second']} is not worse than {found['first']} by more than {margin}",
+        WORSE: f"{found['second']} is worse than {found['first']} by more than {margin}",
+        UNDERPOWERED: f"underpowered: whether {found['second']} is worse than {found['first']} by more than {margin} "
+        "is still open",
+    }[found["verdict"]]
+    lines = [
+        f"Stopped after {counted(found['pairs'], 'pair')}: {claim}. "
+        f"Capital of 'not worse' {found['capital_not_worse']:.3g}, of 'worse' {found['capital_worse']:.3g}; "
+        f"either needed {found['capital_needed']:g}."
+    ]
+    if found["verdict"] == UNDERPOWERED and found["pairs"]:
+        needed = found["pairs_that_would_do"]
+        many = f"more than {MOST_PLAYED} pairs" if needed is None else f"about {needed} pairs"
+        lines.append(
+            f"If both are equally good and part as often as here, {many} would do with a chance of {100 * POWER:g} %."
+        )
+    if found["left_out"] or found["repeats"]:
+        lines.append(
+            f"Left out of the decision: {counted(found['left_out'], 'pair')} with a crash, "
+            f"{counted(found['repeats'], 'repeat')} of a start state."
+        )
+    lines.append(
+        "The data decided the number of pairs: the decision above holds its level, the interval and the p value of the "
+        "paired difference hold theirs at a planned number only."
+    )
+    return lines
 
 
 def once_at_end_sentence(results: Mapping[str, Any]) -> str:

@@ -57,6 +57,6 @@ def test_each_stage_is_entered_from_one_file(tmp_path, monkeypatch):
     results = entry.evaluate_policies(policies, protocol, envs, tmp_path / "report", {}, "the command", console)
     show(results, tmp_path / "report", console)
     stages = {name: callers for name, callers in entered.items() if name not in HELPERS}
-    assert stages == {key: {"evaluate"} for key in ("latency", "play", "video", "report")}
+    assert stages == {key: {"evaluate"} for key in ("latency", "play", "video", "eval_info", "report")}
     assert entered["records"] == {"evaluate"}
     assert entered["rollout"] == {"play"}
