@@ -22,8 +22,8 @@ from manicm_ms.training.log import read_log
 from manicm_ms.training.run_folder import training_folder
 
 COMMANDS = (
-    "list", "check", "collect", "experts", "inspect", "convert", "evaluate", "compare", "benchmark", "calibrate", "board",
-    "cloud", "doctor", "train", "distill",
+    "list", "check", "collect", "experts", "inspect", "convert", "evaluate", "compare", "benchmark", "calibrate",
+    "board", "cloud", "doctor", "train", "distill",
 )  # fmt: skip
 STEPS = 200
 TINY = f"--steps {STEPS} --warmup-steps 2 --batch-size 4 --down-dims 8 16 --points 8 --save-every 50 --log-every 1"
