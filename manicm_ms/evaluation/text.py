@@ -120,7 +120,7 @@ def decision_sentences(results: Mapping[str, Any]) -> list[str]:
         needed = found["pairs_that_would_do"]
         many = f"more than {MOST_PLAYED} pairs" if needed is None else f"about {needed} pairs"
         lines.append(
-            f"If both are equally good and part as often as here, {many} would do with a chance of {100 * POWER:g} %."
+            f"If both are equally good and differ as often as here, {many} would do with a chance of {100 * POWER:g} %."
         )
     if found["left_out"] or found["repeats"]:
         lines.append(
