@@ -219,7 +219,8 @@ def curves(results: Mapping[str, Any] | None) -> dict[str, Line]:
 
 def prediction_table(results: Mapping[str, Any] | None, teacher: str) -> TextTable:
     """Return the learning curves of sample against epsilon, and what each reached on the held-out seeds."""
-    lines, drawn = [], curves(results)
+    lines: list[tuple[str, ...]] = []
+    drawn = curves(results)
     rows = {row["method"]: row for row in results["rows"]} if results else {}
     for name in list(drawn) or prediction_methods(teacher):
         line = drawn.get(name)
