@@ -34,7 +34,6 @@ from manicm_ms.paths import write_json, write_text
 sys.path.insert(0, str(Path(__file__).resolve().parent / "results"))
 from paper_tables import (
     CONTROL,
-    TABLES,
     curves,
     ddim_rows,
     document,
@@ -148,7 +147,7 @@ def run(
 
 def main(
     scale: Literal["smoke", "cpu", "paper"] = "cpu",
-    only: tuple[Table, ...] = TABLES,
+    only: tuple[Table, ...] = ("main", "ddim", "prediction", "real"),
     results: tuple[Path, ...] = (),
     envs: str = "",
     out: Path = Path("runs/tables"),
@@ -182,8 +181,12 @@ def main(
         write_json(out / "tables.json", before | found)
         write_text(out / "tables.md", text)
         if "prediction" in found and (lines := curves(found["prediction"])):
-            panel = Panel("success, %", lines)
-            write_text(out / "learning_curves.svg", curves_plot([panel], "Success over the steps of the training"))
+            whose = {"teacher": False, "student": True}
+            panels = [
+                Panel(f"{role}, success, %", {n: v for n, v in lines.items() if n.startswith("manicm") == is_student})
+                for role, is_student in whose.items()
+            ]
+            write_text(out / "learning_curves.svg", curves_plot(panels, "Success over the steps of the training"))
     return 1 if any(part.get("missing") for part in found.values()) else 0
 
 

@@ -30,6 +30,7 @@ LONGEST = (
     "training/test_interruption.py",
     "tasks/test_rewards.py",
     "benchmark/test_ray_cluster.py",
+    "benchmark/test_reproduce_tables.py",
     "envs/test_mujoco_suites.py",
     "benchmark/test_benchmark_guide.py",
 )

@@ -154,7 +154,9 @@ def curves_plot(panels: Sequence[Panel], description: str) -> str:
             axes.set_yscale("log")
         _plain_axes(axes, panel.label)
         if len(panel.lines) > 1:
-            axes.legend(frameon=False, labelcolor=_INK)
+            axes.legend(
+                frameon=False, labelcolor=_INK, loc="lower left", bbox_to_anchor=(0, 1), ncols=2, fontsize="small"
+            )
     axes.xaxis.set_major_locator(MaxNLocator(integer=True))
     axes.set_xlabel("optimizer steps")
     axes.xaxis.label.set_color(_INK)

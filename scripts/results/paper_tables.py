@@ -33,6 +33,7 @@ EPSILON = "[head.prediction_type=epsilon]"
 CONTROL = "one_step"
 _SAME = ("preset", "demos", "colors", "obs_preset", "episodes", "eval_seed")
 """Keys of a benchmark's plan in which results must agree to stand in one table."""
+_NOT_RUN: Mapping[str, Any] = {"nfe": None, "groups": {}, "average": None, "decision_ms": None}
 TEACHERS = ("dp3", "simple_dp3")
 
 
@@ -148,10 +149,7 @@ def main_table(results: Mapping[str, Any] | None) -> TextTable:
         if not read_name(row["method"]).overrides:
             by_kind.setdefault(read_name(row["method"]).kind, []).append(row)
     for kind in (*PRINTED["main"], *(k for k in by_kind if k not in PRINTED["main"])):
-        for row in by_kind.get(
-            kind, [{"method": kind, "nfe": None, "groups": {}, "average": None, "decision_ms": None}]
-        ):
-            lines.append(_ours(row, groups, sizes))
+        lines += [_ours(row, groups, sizes) for row in by_kind.get(kind, [{"method": kind, **_NOT_RUN}])]
         if kind in PRINTED["main"]:
             lines.append(_printed(PRINTED["main"][kind], groups))
     headers = ("method", "whose", "NFE", *heads, "average", "one decision")
@@ -226,7 +224,8 @@ def curves(results: Mapping[str, Any] | None) -> dict[str, Line]:
 
 def prediction_table(results: Mapping[str, Any] | None, teacher: str) -> TextTable:
     """Return the learning curves of sample against epsilon, and what each reached on the held-out seeds."""
-    lines, drawn = [], curves(results)
+    lines: list[tuple[str, ...]] = []
+    drawn = curves(results)
     rows = {row["method"]: row for row in results["rows"]} if results else {}
     for name in list(drawn) or prediction_methods(teacher):
         line = drawn.get(name)
