@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import math
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -65,16 +64,16 @@ class LossBar:
 
     def __init__(self, progress: Progress, title: str, total: int) -> None:
         self._progress = progress
-        self._task = progress.add_task(title, total=total, loss=math.nan)
+        self._task = progress.add_task(title, total=total, loss="-")
 
     def update(self, step: int, loss: float | None = None) -> None:
         """Show that `step` steps are done."""
-        shown: dict[str, Any] = {} if loss is None else {"loss": loss}
+        shown: dict[str, Any] = {} if loss is None else {"loss": f"{loss:.4g}"}
         self._progress.update(self._task, completed=step, **shown)
 
 
 @contextmanager
 def loss_bar(console: Console | None, title: str, total: int) -> Iterator[LossBar]:
     """Yield a progress bar on `console`, or one that shows nothing where that is None."""
-    with progress_bars(console, "loss {task.fields[loss]:.4g}") as shown:
+    with progress_bars(console, "loss {task.fields[loss]}") as shown:
         yield LossBar(shown, title, total)
