@@ -20,7 +20,7 @@ from manicm_ms.evaluation.text import format_ms
 from manicm_ms.wording import counted
 
 REPO = Path(__file__).resolve().parents[2]
-PRINTED: Mapping[str, Any] = json.loads((REPO / "docs" / "results" / "data" / "manicm_paper.json").read_text())
+PRINTED: Mapping[str, Any] = json.loads(Path(__file__).with_name("manicm_paper.json").read_text())
 MISSING = "\u2013"
 LEGEND = f"{MISSING}: not run here, or not printed in the paper; never a zero."
 TABLES: tuple[Literal["main"], Literal["ddim"], Literal["prediction"], Literal["real"]] = (
