@@ -4,6 +4,7 @@ import math
 
 import pytest
 import torch
+import torchvision_oracle  # noqa: F401  diffusers.training_utils imports torchvision
 from diffusers.training_utils import EMAModel
 from torch import nn
 
