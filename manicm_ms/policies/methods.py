@@ -25,201 +25,153 @@ from manicm_ms.spec import ChunkSpec, EnvSpec
 STUDENT = "manicm"
 """The method that a distillation makes of a teacher that no row names."""
 
-
-_CLOUD_INPUTS: Mapping[str, Nested] = {"cloud_crop": {}, "points": {}, "cloud_frame": {}}
-_DP3 = "Ze et al. 2024, 3D Diffusion Policy, arXiv:2403.03954"
 _MANICM = "Gao, Lu et al. 2024, ManiCM, arXiv:2406.01586"
-_PAPER = {"paper": ChunkSpec(2, 4, 2)}  # ManiCM, section 4.1
+_ROBOMIMIC = "Mandlekar et al. 2021, robomimic, arXiv:2108.03298"
 _SIMPLE_UNET = {NAME: "unet1d", "down_dims": (128, 256, 384), "resnets_per_stage": 1, "mid_blocks": 1}
+_PLAIN_ADAM: Nested = {"betas": (0.9, 0.999), "weight_decay": 0.0}  # robomimic's
 
-METHODS.add(
-    "dp3",
-    Method(
-        sentence="DP3's diffusion teacher: a U-Net of 512, 1024 and 2048 channels, evaluated 10 times a decision.",
-        reference=_DP3,
-        encoder="dp3",
-        backbone="unet1d",
-        head="diffusion",
-        objective="averaged",
-        nfe=10,
-        chunk=ChunkSpec(2, 4, 3),
-        size_chunks=_PAPER,
-        inputs=_CLOUD_INPUTS,
-    ),
+# The other rows say how they depart from this one.
+_DP3 = Method(
+    sentence="DP3's diffusion teacher: a U-Net of 512, 1024 and 2048 channels, evaluated 10 times a decision.",
+    reference="Ze et al. 2024, 3D Diffusion Policy, arXiv:2403.03954",
+    encoder="dp3",
+    backbone="unet1d",
+    head="diffusion",
+    objective="averaged",
+    nfe=10,
+    chunk=ChunkSpec(2, 4, 3),
+    size_chunks={"paper": ChunkSpec(2, 4, 2)},  # ManiCM, section 4.1
+    inputs={"cloud_crop": {}, "points": {}, "cloud_frame": {}},
 )
+METHODS.add("dp3", _DP3)
 METHODS.add(
     "simple_dp3",
-    Method(
+    replace(
+        _DP3,
         sentence="Simple DP3's diffusion teacher: the same with a U-Net of 128, 256 and 384 channels.",
-        reference=_DP3,
-        encoder="dp3",
         backbone=_SIMPLE_UNET,
-        head="diffusion",
-        objective="averaged",
-        nfe=10,
-        chunk=ChunkSpec(2, 4, 3),
-        size_chunks=_PAPER,
-        inputs=_CLOUD_INPUTS,
     ),
 )
 METHODS.add(
     "dp",
-    Method(
+    replace(
+        _DP3,
         sentence="Diffusion Policy from images: its hybrid ResNet-18 encoder on DP3's protocol, predicting noise.",
         reference="Chi et al. 2023, Diffusion Policy, arXiv:2303.04137",
         encoder="image",
-        backbone="unet1d",
         head={NAME: "diffusion", "prediction_type": "epsilon"},
-        objective="averaged",
-        nfe=10,
-        chunk=ChunkSpec(2, 4, 3),
-        size_chunks=_PAPER,
         inputs={"image_crop": {}},
     ),
 )
 METHODS.add(
     "voxel_dp",
-    Method(
+    replace(
+        _DP3,
         sentence="DP3's teacher from voxel grids: eight 3D convolutions in place of the encoder of clouds.",
         reference="encoder: Wang et al. 2024, Equivariant Diffusion Policy, arXiv:2407.01812",
         encoder="voxel",
-        backbone="unet1d",
-        head="diffusion",
-        objective="averaged",
-        nfe=10,
-        chunk=ChunkSpec(2, 4, 3),
-        size_chunks=_PAPER,
         inputs={"voxel_crop": {}},
-    ),
-)
-
-
-def _student_row(teacher: str, sentence: str) -> Method:
-    """Return the row of what is distilled from a teacher as ManiCM: the teacher's parts with a student's head."""
-    row = METHODS.get(teacher)
-    shared = ("prediction_type", "num_train_timesteps", "beta_schedule", "clip_range")
-    process = {name: value for name, value in described(row.head).items() if name in shared}
-    spacing = PREDICTIONS.get(process.get("prediction_type", "sample")).timestep_spacing
-    head = {NAME: "consistency", **process, "timestep_spacing": spacing}
-    reference = f"{_MANICM}; the teacher's: {row.reference}"
-    return replace(
-        row, sentence=sentence, reference=reference, head=head, objective="consistency", nfe=1, teachers=(teacher,)
-    )
-
-
-METHODS.add(
-    STUDENT,
-    Method(
-        sentence="ManiCM's student, distilled from DP3 or Simple DP3: evaluated once a decision.",
-        reference=_MANICM,
-        encoder="dp3",
-        backbone="unet1d",
-        head="consistency",
-        objective="consistency",
-        nfe=1,
-        chunk=ChunkSpec(2, 4, 3),
-        size_chunks=_PAPER,
-        inputs=_CLOUD_INPUTS,
-        teachers=("simple_dp3", "dp3"),
-    ),
-)
-METHODS.add(
-    "bc_gmm_3d",
-    Method(
-        sentence="Behaviour cloning with a mixture of 5 Gaussians, one action a decision.",
-        reference="Mandlekar et al. 2021, robomimic, arXiv:2108.03298",
-        encoder="dp3",
-        head="gmm",
-        objective="plain",
-        nfe=1,
-        chunk=ChunkSpec(1, 1, 1),
-        inputs=_CLOUD_INPUTS,
-        optimizer={"betas": (0.9, 0.999), "weight_decay": 0.0},
     ),
 )
 METHODS.add(
     "pocket_dp3",
-    Method(
+    replace(
+        _DP3,
         sentence="Pocket DP3: a mixer of 2.5 million weights in place of the U-Net, evaluated twice a decision.",
         reference="arXiv:2601.22018, arXiv:2605.01581",
-        encoder="dp3",
         backbone="mixer",
         head={NAME: "diffusion", "num_inference_steps": 2},
-        objective="averaged",
         nfe=2,
-        chunk=ChunkSpec(2, 4, 3),
-        size_chunks=_PAPER,
-        inputs=_CLOUD_INPUTS,
+    ),
+)
+
+
+def _student_row(teachers: tuple[str, ...], sentence: str) -> Method:
+    """Return the row of what is distilled as ManiCM: the last teacher's parts with a student's head."""
+    row = METHODS.get(teachers[-1])
+    shared = ("prediction_type", "num_train_timesteps", "beta_schedule", "clip_range")
+    process = {name: value for name, value in described(row.head).items() if name in shared}
+    spacing = PREDICTIONS.get(process.get("prediction_type", "sample")).timestep_spacing
+    head = {NAME: "consistency", **process, "timestep_spacing": spacing}
+    return replace(
+        row, sentence=sentence, reference=f"{_MANICM}; teacher: {row.reference}", head=head, objective="consistency",
+        nfe=1, teachers=teachers,
+    )  # fmt: skip
+
+
+for _name, _teachers, _sentence in (
+    (STUDENT, ("simple_dp3", "dp3"), "ManiCM's student, distilled from DP3 or Simple DP3: evaluated once a decision."),
+    ("image_manicm", ("dp",), "ManiCM from camera images: the student of dp, evaluated once a decision."),
+    ("voxel_manicm", ("voxel_dp",), "ManiCM from voxel grids: the student of voxel_dp, evaluated once a decision."),
+    (
+        "pocket_manicm",
+        ("pocket_dp3",),
+        "Pocket DP3's student, distilled as ManiCM: the mixer evaluated once a decision.",
+    ),
+):
+    METHODS.add(_name, _student_row(_teachers, _sentence))
+
+METHODS.add(
+    "bc_gmm_3d",
+    replace(
+        _DP3,
+        sentence="Behaviour cloning with a mixture of 5 Gaussians, one action a decision.",
+        reference=_ROBOMIMIC,
+        backbone=None,
+        head="gmm",
+        objective="plain",
+        nfe=1,
+        chunk=ChunkSpec(1, 1, 1),
+        size_chunks={},
+        optimizer=_PLAIN_ADAM,
     ),
 )
 METHODS.add(
-    "pocket_manicm",
-    _student_row("pocket_dp3", "Pocket DP3's student, distilled as ManiCM: the mixer evaluated once a decision."),
-)
-METHODS.add(
-    "image_manicm", _student_row("dp", "ManiCM from camera images: the student of dp, evaluated once a decision.")
-)
-METHODS.add(
-    "voxel_manicm",
-    _student_row("voxel_dp", "ManiCM from voxel grids: the student of voxel_dp, evaluated once a decision."),
-)
-METHODS.add(
     "bc_rnn_3d",
-    Method(
+    replace(
+        _DP3,
         sentence="Behaviour cloning with an LSTM over the last 10 frames, one action a decision.",
-        reference="Mandlekar et al. 2021, robomimic, arXiv:2108.03298",
-        encoder="dp3",
+        reference=_ROBOMIMIC,
+        backbone=None,
         head="rnn",
         objective="plain",
         nfe=1,
         chunk=ChunkSpec(10, 10, 1),
-        inputs=_CLOUD_INPUTS,
-        optimizer={"betas": (0.9, 0.999), "weight_decay": 0.0},
+        size_chunks={},
+        optimizer=_PLAIN_ADAM,
     ),
 )
 METHODS.add(
     "meanflow",
-    Method(
+    replace(
+        _DP3,
         sentence="MeanFlow: one evaluation a decision, learnt from demonstrations without a teacher.",
         reference="Geng et al. 2025, arXiv:2505.13447; MP1, arXiv:2507.10543",
-        encoder="dp3",
         backbone=_SIMPLE_UNET,
         head="meanflow",
-        objective="averaged",
         nfe=1,
-        chunk=ChunkSpec(2, 4, 3),
-        size_chunks=_PAPER,
-        inputs=_CLOUD_INPUTS,
     ),
 )
 METHODS.add(
     "drift",
-    Method(
+    replace(
+        _DP3,
         sentence="Drifting: samples move to demonstrations and away from one another; one evaluation, no teacher.",
         reference="Deng et al. 2026, arXiv:2602.04770; DBP, arXiv:2604.03540",
-        encoder="dp3",
         backbone=_SIMPLE_UNET,
         head="drift",
-        objective="averaged",
         nfe=1,
-        chunk=ChunkSpec(2, 4, 3),
-        size_chunks=_PAPER,
-        inputs=_CLOUD_INPUTS,
     ),
 )
 METHODS.add(
     "uca_flow",
-    Method(
+    replace(
+        _DP3,
         sentence="UCA-Flow: average velocity on joint tokens of frames and actions; one evaluation, no teacher.",
         reference="arXiv:2608.16153",
-        encoder="dp3",
         backbone="tokens",
         head="uca_flow",
-        objective="averaged",
         nfe=1,
-        chunk=ChunkSpec(2, 4, 3),
-        size_chunks=_PAPER,
-        inputs=_CLOUD_INPUTS,
     ),
 )
 
