@@ -105,7 +105,7 @@ from manicm_ms.policies.methods import METHODS
 from manicm_ms.training.objectives.objective import OBJECTIVES
 assert "ur3e/slide-block" in ENVS.names()
 assert HEADS.get("rnn").__module__ == "manicm_ms.policies.heads.rnn"
-assert {"gmm", "rnn", "diffusion", "consistency"} == set(HEADS.names())
+assert {"gmm", "rnn", "diffusion", "consistency"} <= set(HEADS.names())
 assert {"dp3", "bc_gmm_3d"} <= set(METHODS.names()) and "half_done" not in METHODS.names()
 assert OBJECTIVES.names() == ("plain", "averaged")
 print(load_checkpoint(Path(CHECKPOINT)).name)

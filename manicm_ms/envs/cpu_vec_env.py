@@ -17,7 +17,7 @@ from manicm_ms.envs.main_script import NO_GUARD_STATUS, main_script, no_guard, r
 from manicm_ms.envs.requests import Seeds
 from manicm_ms.envs.simulator import EnvEntry, SimulatorConfig
 from manicm_ms.envs.vector import Info, Obs, VecEnv
-from manicm_ms.envs.worker import FACTS, RowEnv
+from manicm_ms.envs.worker import FACTS, RowEnv, package_folders
 from manicm_ms.envs.worker_pool import WorkerPool
 from manicm_ms.errors import BackendError, ManicmError
 from manicm_ms.spec import ChunkSpec, EnvSpec
@@ -37,7 +37,7 @@ class CpuVecEnv(VecEnv):
         super().__init__(entry, spec, num_envs, config, chunk)
         self.device = torch.device("cpu")
         require_importable_main()
-        make = functools.partial(RowEnv, spec.env_id, entry.module, config, chunk)
+        make = functools.partial(RowEnv, spec.env_id, entry.module, config, chunk, package_folders(entry.module))
         try:
             self._workers = WorkerPool(make, num_envs, [__name__, entry.module, *entry.preload])
         except _DEAD_WORKER as error:

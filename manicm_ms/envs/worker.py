@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import gc
 import importlib
+import sys
 import traceback
 from typing import Any
 
@@ -36,6 +37,16 @@ def action_space(spec: EnvSpec, n_action_steps: int | None) -> spaces.Box:
     return spaces.Box(-1.0, 1.0, (*chunk, spec.action.dim), np.float32)
 
 
+def package_folders(task_module: str) -> tuple[str, ...]:
+    """Return the folders of the package that a task's module lies in, as this process knows them.
+
+    Workers are forked from a server that started with the environment of that moment: folders that became known later,
+    by MANICM_MS_TASKS or otherwise, it does not know.
+    """
+    package = sys.modules.get(task_module.rpartition(".")[0])
+    return tuple(getattr(package, "__path__", ()))
+
+
 FACTS = "facts"
 """The one key of a worker's info: a tuple that holds a dictionary of plain values."""
 
@@ -48,13 +59,30 @@ class RowEnv(gymnasium.Env[dict[str, np.ndarray], np.ndarray]):
 
     The simulator is built at the first reset, in the process that will use it: gymnasium's AsyncVectorEnv also makes
     one environment in the parent, only to read its spaces, and a renderer there would cost memory and seconds.
+
+    Args:
+        env_id: its id.
+        task_module: module that registers it.
+        config: of the simulator.
+        chunk: To, Tp, Ta; None for plain steps.
+        folders: further folders of the module's package, those that the parent process knows; see `package_folders`.
     """
 
     metadata = {"render_modes": ["rgb_array"]}  # noqa: RUF012 (Gymnasium declares it without ClassVar)
     render_mode = "rgb_array"
 
-    def __init__(self, env_id: str, task_module: str, config: SimulatorConfig, chunk: ChunkSpec | None) -> None:
+    def __init__(
+        self,
+        env_id: str,
+        task_module: str,
+        config: SimulatorConfig,
+        chunk: ChunkSpec | None,
+        folders: tuple[str, ...] = (),
+    ) -> None:
         self._env_id, self._task_module, self._config, self._chunk = env_id, task_module, config, chunk
+        if folders:
+            path = importlib.import_module(task_module.rpartition(".")[0]).__path__
+            path.extend(folder for folder in folders if folder not in path)
         importlib.import_module(task_module)  # registers the id in this process, and only this one
         self.env_spec = config.specialise(ENVS.get_registered(env_id).spec)
         self.observation_space: spaces.Space[Any] = observation_space(

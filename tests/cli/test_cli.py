@@ -22,7 +22,7 @@ from manicm_ms.training.log import read_log
 from manicm_ms.training.run_folder import training_folder
 
 COMMANDS = (
-    "list", "check", "collect", "experts", "inspect", "convert", "evaluate", "report", "compare", "benchmark",
+    "list", "check", "collect", "experts", "inspect", "convert", "evaluate", "compare", "report", "benchmark",
     "calibrate", "board", "cloud", "doctor", "train", "distill",
 )  # fmt: skip
 STEPS = 200

@@ -35,7 +35,9 @@ def test_an_evaluation_renders_what_the_policy_reads_as_it_was_stored(path):
         episode = store.episode(0)
     with closing(env_maker(EnvRequest(ENV_ID)).for_policy(policy, 1, "clean")) as env:
         assert policy.keys == ("voxel_grid", "agent_pos")
-        assert set(env.single_observation_space) == set(policy.keys)
+        assert set(env.single_observation_space) == {*policy.keys, "state"}, (
+            "the state's digest tells start states apart"
+        )
         first, _ = env.reset(seed=[episode.seed])
         later, *_ = env.step(torch.from_numpy(episode.action[None, :3]))
         result = rollout(env, policy, [episode.seed])[0]

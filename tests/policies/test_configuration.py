@@ -291,8 +291,8 @@ def test_a_size_is_what_each_part_says_of_it():
     assert published["backbone"]["down_dims"] == (128, 256, 384)
     assert quick["backbone"] == {"name": "unet1d", "down_dims": (64, 128, 256), "resnets_per_stage": 1, "mid_blocks": 1}
     assert smoke["backbone"]["down_dims"] == (32, 64)
-    assert published["inputs"] == {"points": {}, "cloud_frame": {}}
-    assert quick["inputs"] == {"points": {"max_points": 128}, "cloud_frame": {"frame": "auto"}}
+    assert published["inputs"] == {"cloud_crop": {}, "points": {}, "cloud_frame": {}}
+    assert quick["inputs"] == {"cloud_crop": {}, "points": {"max_points": 128}, "cloud_frame": {"frame": "auto"}}
     assert smoke["inputs"]["points"] == {"max_points": 64}
     assert [c["normalizer"] for c in (published, quick)] == [{}, {"min_state_range": 0.02}]
     assert quick["head"] == {"name": "diffusion"}
@@ -311,6 +311,7 @@ def test_changes_go_over_the_size_and_the_row_stays_as_it_is():
     config = row.configuration("quick", changes)
     assert config["backbone"] == {"name": "unet1d", "down_dims": (16, 32), "resnets_per_stage": 1, "mid_blocks": 1}
     assert config["inputs"] == {
+        "cloud_crop": {},
         "points": {"max_points": 128, "acting": "random"},
         "cloud_frame": {"frame": "auto"},
     }
