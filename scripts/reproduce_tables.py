@@ -22,12 +22,11 @@ from typing import Any, Literal
 import tyro
 from rich.console import Console
 
-from manicm_ms.benchmark.method_names import read_name
-from manicm_ms.benchmark.methods import method_names
+from manicm_ms.benchmark.methods import parse_methods
 from manicm_ms.benchmark.plan import Plan, parse_envs
 from manicm_ms.benchmark.run import benchmark
 from manicm_ms.envs.backends import default_num_envs
-from manicm_ms.errors import ManicmError
+from manicm_ms.errors import ManicmError, UnknownNameError
 from manicm_ms.evaluation.plots import Panel, curves_plot
 from manicm_ms.paths import write_json, write_text
 
@@ -106,8 +105,14 @@ SCALES = {
 
 def known(names: Iterable[str]) -> tuple[str, ...]:
     """Return the names that are methods of this version."""
-    kinds = method_names()
-    return tuple(name for name in names if read_name(name).kind in kinds)
+    return tuple(name for name in names if _is_known(name))
+
+
+def _is_known(name: str) -> bool:
+    try:
+        return bool(parse_methods([name]))
+    except UnknownNameError:
+        return False
 
 
 def plans(scale: Scale, out: Path, only: Sequence[str], device: str) -> dict[str, Plan]:
