@@ -175,3 +175,7 @@ def test_bad_results_are_refused_in_one_line(script, tmp_path):
     (tmp_path / "results.json").write_text("{}")
     with pytest.raises(ConfigError, match="holds no results"):
         script.main(results=(tmp_path,))
+    for damaged in ('{"cells": []}', '{"cells": [{}]}', '{"main": {}}', '{"main": 1}'):
+        (tmp_path / "results.json").write_text(damaged)
+        with pytest.raises(ConfigError, match="lack something"):
+            script.main(results=(tmp_path,))
