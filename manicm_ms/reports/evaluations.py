@@ -60,8 +60,9 @@ def named_evaluation(folder: Path, checkpoints: Mapping[str, int]) -> Evaluation
     try:
         return _named(Path(folder), results, request, checkpoints)
     except (KeyError, TypeError, AttributeError, ValueError, IndexError) as error:
+        why = f"{type(error).__name__}: {error}"
         raise ConfigError(
-            f"{folder} cannot be read as an evaluation's ({type(error).__name__}: {error}): evaluate again, or leave it out"
+            f"{folder} cannot be read as an evaluation's ({why}): evaluate again, or leave it out"
         ) from error
 
 
