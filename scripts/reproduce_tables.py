@@ -110,10 +110,9 @@ def known(names: Iterable[str]) -> tuple[str, ...]:
 
 def _is_known(name: str) -> bool:
     try:
-        parse_methods([name])
+        return bool(parse_methods([name]))
     except UnknownNameError:
         return False
-    return True
 
 
 def plans(scale: Scale, out: Path, only: Sequence[str], device: str) -> dict[str, Plan]:

@@ -14,7 +14,7 @@ from rich.console import Console
 from manicm_ms.benchmark.method_names import MethodName, folder_name, read_name
 from manicm_ms.errors import ConfigError, UnknownNameError
 from manicm_ms.policies.configuration import parse_overrides
-from manicm_ms.policies.methods import METHODS, STUDENT, head_with_nfe, methods_of
+from manicm_ms.policies.methods import METHODS, STUDENT, head_with_nfe, methods_of, student_name
 from manicm_ms.training.optim import FitConfig
 from manicm_ms.training.presets import CHUNK, STUDENT_PRESETS, StudentPreset, TeacherPreset, preset_for
 
@@ -317,4 +317,7 @@ def _teacher_of(name: MethodName, teachers: Sequence[MethodName]) -> Trained:
     possible = methods_of("teacher")
     if chosen.kind not in possible:
         raise UnknownNameError("teacher", chosen.kind, possible)
+    if own and not any_teacher and chosen.kind not in own:
+        made = student_name(chosen.kind)
+        raise ConfigError(f"{kind} is the student of {' or '.join(own)}, that of {chosen.kind} is {made}: use {made!r}")
     return Trained(str(chosen))

@@ -31,7 +31,8 @@ def compare_command(
     """Compare policies on the same start states: better, worse, not worse by more than a margin, or underpowered.
 
     Args:
-        policies: folders of finished evaluations, whose records are compared, and checkpoints, which are played first.
+        policies: folders of finished evaluations, whose records are compared, and checkpoints, which are played first;
+            FOLDER@4 is a checkpoint whose network is evaluated 4 times a decision.
         env: environment id that checkpoints are played in.
         out: folder of compare.json, compare.md and the evaluations of checkpoints.
         episodes: held-out seeds on which checkpoints are played.

@@ -20,6 +20,8 @@ from manicm_ms.sensing.camera import CameraModel
 from manicm_ms.sensing.realism import Realism, RealismSample, objects_of
 from manicm_ms.spec import AGENT_POS, DP3_FRAME, OBS_KEYS, POINT_CLOUD, VOXEL_SIZE, EnvSpec
 
+MOST_CELLS = 256
+"""Along a side of a voxel grid: a frame of 256^3 takes 16 MiB without colours."""
 OBS_PRESETS = ("manicm_ms", "dp3")
 """How observations are made: the package's own way, and that of the public DP3 wrapper (Adroit and Meta-World)."""
 REWARD_MODES = ("sparse", "dense", "normalized_dense", "none")
@@ -80,6 +82,8 @@ class SimulatorConfig:
             raise ConfigError(f"unknown reward_mode {self.reward_mode!r}: choose from {', '.join(REWARD_MODES)}")
         if self.obs_preset not in OBS_PRESETS:
             raise ConfigError(f"unknown obs_preset {self.obs_preset!r}: choose from {', '.join(OBS_PRESETS)}")
+        if self.voxel_size > MOST_CELLS:
+            raise ConfigError(f"voxel_size must be at most {MOST_CELLS} cells along a side, got {self.voxel_size}")
         require_at_least(
             1, num_envs=self.num_rows, num_points=self.num_points, image_size=min(self.image_size),
             voxel_size=self.voxel_size,

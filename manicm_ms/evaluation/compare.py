@@ -17,6 +17,7 @@ from manicm_ms.evaluation.contestants import (
     Contestant,
     common_seeds,
     conditions,
+    evaluations_asked,
     is_checkpoint,
     read_evaluation,
     with_distinct_names,
@@ -24,7 +25,7 @@ from manicm_ms.evaluation.contestants import (
 )
 from manicm_ms.evaluation.evaluate import evaluate
 from manicm_ms.evaluation.policies import load_policies, require_playable
-from manicm_ms.evaluation.protocol import CLEAN, OBS_PRESET, EvaluatedPolicy, Protocol, slug
+from manicm_ms.evaluation.protocol import CLEAN, OBS_PRESET, EvaluatedPolicy, Protocol, seeds_from, slug
 from manicm_ms.evaluation.records import claimed_folder
 from manicm_ms.evaluation.request import requested_realism
 from manicm_ms.evaluation.rollout import EpisodeResult
@@ -66,7 +67,7 @@ class Playing:
     @property
     def seeds(self) -> tuple[int, ...]:
         """All seeds."""
-        return tuple(range(self.seed, self.seed + self.episodes))
+        return seeds_from(self.seed, self.episodes)
 
     def evaluate(self, checkpoint: str, out: Path, console: Console) -> None:
         """Evaluate one checkpoint alone into `out`, or go on where that was stopped."""
@@ -91,8 +92,8 @@ def compare(
     """Compare policies and write compare.json and compare.md.
 
     Args:
-        sources: checkpoint folders and folders of finished evaluations, at least two policies in all. Checkpoints are
-            evaluated into `out`; the same call goes on where that was stopped.
+        sources: checkpoint folders (or FOLDER@N, see `load_policies`) and folders of finished evaluations, at least two
+            policies in all. Checkpoints are evaluated into `out`; the same call goes on where that was stopped.
         out: folder of the comparison.
         playing: how checkpoints are evaluated.
         margin: difference of success rates that does not matter, in (0, 1).
@@ -167,8 +168,8 @@ def _to_be_played(checkpoints: Sequence[Path], playing: Playing) -> list[Contest
     unknown = {seed: EpisodeResult(seed, False, 0, 0, 0.0) for seed in playing.seeds}
     return [
         Contestant(
-            policy.name, policy.checkpoint, policy.role, policy.checkpoint, ("", policy.digest), playing.env_id, where,
-            False, unknown,
+            policy.name, policy.checkpoint, policy.role, policy.checkpoint,
+            ("", policy.digest, evaluations_asked(policy.name)), playing.env_id, where, False, unknown,
         )
         for policy in loaded
     ]  # fmt: skip

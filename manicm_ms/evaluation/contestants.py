@@ -10,6 +10,7 @@ from typing import Any
 
 from manicm_ms.errors import ConfigError, NotComparableError
 from manicm_ms.evaluation.pairs import states_differ
+from manicm_ms.evaluation.policies import AskedCheckpoint
 from manicm_ms.evaluation.protocol import CLEAN, CONTROL
 from manicm_ms.evaluation.records import RUN_FILE
 from manicm_ms.evaluation.rollout import EpisodeResult
@@ -59,8 +60,11 @@ class Contestant:
 
 
 def is_checkpoint(folder: Path) -> bool:
-    """Return whether the folder holds a checkpoint; raise ConfigError where it holds no finished evaluation either."""
-    if (folder / MANIFEST_FILE).is_file():
+    """Return whether FOLDER, or that of FOLDER@N, holds a checkpoint.
+
+    Raises ConfigError where it holds no finished evaluation either.
+    """
+    if (AskedCheckpoint.read(folder).folder / MANIFEST_FILE).is_file():
         return True
     if (folder / RESULTS_FILE).is_file():
         return False
@@ -90,7 +94,9 @@ def read_evaluation(folder: Path) -> list[Contestant]:
 def _contestants(folder: Path, results: Mapping[str, Any], run: Mapping[str, Any]) -> list[Contestant]:
     presets = results["realism"]["presets"] if "realism" in results else [CLEAN]
     identities: Mapping[str, tuple[str, ...]] = {
-        name: (place if place == CONTROL else "", digest) for name, place, digest in run.get("policies", ()) if digest
+        name: (place if place == CONTROL else "", digest, evaluations_asked(name))
+        for name, place, digest in run.get("policies", ())
+        if digest
     }
     return [
         Contestant(
@@ -106,6 +112,12 @@ def _contestants(folder: Path, results: Mapping[str, Any], run: Mapping[str, Any
         )
         for policy in results["policies"]
     ]
+
+
+def evaluations_asked(name: str) -> str:
+    """Return the N of a policy called CHECKPOINT@N, "" of any other: one digest, and another policy."""
+    number = name.split(",", 1)[0].rpartition("@")[2]  # "CHECKPOINT@N, one step" is the control
+    return number if number.isdecimal() and "@" in name else ""
 
 
 def conditions(preset: str, run: Mapping[str, Any]) -> dict[str, Any]:

@@ -16,7 +16,7 @@ from manicm_ms.evaluation.latency import stored_or_measured
 from manicm_ms.evaluation.origins import remarks
 from manicm_ms.evaluation.play import EnvMaker, Played, env_maker, play, play_in_blocks
 from manicm_ms.evaluation.policies import load_policies, require_playable, with_users
-from manicm_ms.evaluation.protocol import CLEAN, OBS_PRESET, EvaluatedPolicy, Protocol
+from manicm_ms.evaluation.protocol import CLEAN, OBS_PRESET, EvaluatedPolicy, Protocol, seeds_from
 from manicm_ms.evaluation.records import claimed_folder
 from manicm_ms.evaluation.report import write_report
 from manicm_ms.evaluation.request import command_of, identity_of
@@ -90,7 +90,7 @@ def evaluate(
     from manicm_ms.envs.env_request import EnvRequest
     from manicm_ms.envs.simulator import ENVS, SimulatorConfig
 
-    entry, seeds = ENVS.get(env_id), tuple(range(seed, seed + episodes))
+    entry, seeds = ENVS.get(env_id), seeds_from(seed, episodes)
     presets, rows = parse_presets(realism), _rows(num_envs, episodes)
     where, device = resolve_backend(backend, entry), str(resolve_device(device))
     env = EnvRequest(env_id, where, colors=colors, realism=realism, camera=camera, obs_preset=obs_preset)

@@ -28,7 +28,7 @@ def load_policies(checkpoints: Sequence[Path], device: str = "cpu", control: boo
     """
     from manicm_ms.policies.checkpoint import load_checkpoint, read_manifest
 
-    asked = [_Asked.read(p) for p in checkpoints]
+    asked = [AskedCheckpoint.read(p) for p in checkpoints]
     names = _names(asked)
     loaded = [load_checkpoint(a.folder, device=device) for a in asked]
     policies = []
@@ -43,14 +43,14 @@ def load_policies(checkpoints: Sequence[Path], device: str = "cpu", control: boo
     return policies
 
 
-class _Asked(NamedTuple):
+class AskedCheckpoint(NamedTuple):
     """A checkpoint as the caller names it: its folder, and network evaluations where they are not its own."""
 
     folder: Path
     nfe: int | None = None
 
     @classmethod
-    def read(cls, path: Path) -> _Asked:
+    def read(cls, path: Path) -> AskedCheckpoint:
         """Return what FOLDER or FOLDER@N names; a folder whose own name ends so is that folder."""
         folder, at, number = str(path).rpartition("@")
         if at and number.isdecimal() and not Path(path).exists():
@@ -61,7 +61,7 @@ class _Asked(NamedTuple):
         return str(self.folder) if self.nfe is None else f"{self.folder}@{self.nfe}"
 
 
-def _names(asked: Sequence[_Asked]) -> list[str]:
+def _names(asked: Sequence[AskedCheckpoint]) -> list[str]:
     """Return a name for each checkpoint, no two alike."""
     ends = ["" if a.nfe is None else f"@{a.nfe}" for a in asked]
     names = [f"{a.folder.resolve().name}{end}" for a, end in zip(asked, ends, strict=True)]

@@ -23,8 +23,18 @@ CLEAN = "clean"
 OBS_PRESET = "manicm_ms"
 """The package's own way of making observations."""
 
+MOST_EPISODES = 1_000_000
+"""Seeds of an evaluation are listed one by one; nobody plays as many."""
+
 Conditions = Callable[[str, int], RealismSample]
 """(realism preset, seed) -> what is drawn for that episode beside its scene."""
+
+
+def seeds_from(seed: int, episodes: int) -> tuple[int, ...]:
+    """Return seed, seed + 1, ..., one for each episode; raise ConfigError where there are more than `MOST_EPISODES`."""
+    if episodes > MOST_EPISODES:
+        raise ConfigError(f"--episodes must be at most {MOST_EPISODES}, got {episodes}")
+    return tuple(range(seed, seed + episodes))
 
 
 @dataclass(frozen=True)

@@ -8,6 +8,8 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from manicm_ms.errors import ConfigError
+from manicm_ms.evaluation.contestants import evaluations_asked
+from manicm_ms.evaluation.protocol import CONTROL
 from manicm_ms.evaluation.records import RUN_FILE
 from manicm_ms.evaluation.results import renewed
 from manicm_ms.evaluation.text import HEADERS, episodes_title, paired_sentences, realism_sentence, rows
@@ -33,7 +35,7 @@ class Evaluation(NamedTuple):
         rows: a policy each, those of this training marked.
         sentences: what the paired comparison says.
         command: that made it.
-        points: what the training's checkpoints reached.
+        points: what the training's checkpoints reached with their own number of network evaluations.
     """
 
     path: Path
@@ -52,9 +54,21 @@ def named_evaluation(folder: Path, checkpoints: Mapping[str, int]) -> Evaluation
         folder: that `manicm-ms evaluate` wrote.
         checkpoints: SHA-256 of a manifest -> steps, of the checkpoints that are asked for.
 
-    Raises ConfigError where it is not there, not finished, or of other checkpoints.
+    Raises ConfigError where it is not there, not finished, damaged, or of other checkpoints.
     """
     results, request = (_read(Path(folder) / name) for name in ("results.json", RUN_FILE))
+    try:
+        return _named(Path(folder), results, request, checkpoints)
+    except (KeyError, TypeError, AttributeError, ValueError, IndexError) as error:
+        why = f"{type(error).__name__}: {error}"
+        raise ConfigError(
+            f"{folder} cannot be read as an evaluation's ({why}): evaluate again, or leave it out"
+        ) from error
+
+
+def _named(
+    folder: Path, results: Mapping[str, Any], request: Mapping[str, Any], checkpoints: Mapping[str, int]
+) -> Evaluation:
     digests = [digest for _, _, digest in request.get("policies", [])]
     steps = [checkpoints.get(digest) for digest in digests]
     found = renewed(results)
@@ -66,11 +80,11 @@ def named_evaluation(folder: Path, checkpoints: Mapping[str, int]) -> Evaluation
     points = [
         Point(step, policy["n"], policy["successes"])
         for policy, step in zip(policies, steps, strict=True)
-        if step is not None and policy["role"] != "control"
+        if step is not None and policy["role"] != CONTROL and not evaluations_asked(policy["name"])
     ]
     sentences = [*filter(None, [realism_sentence(found)]), *paired_sentences(found)]
     title = f"{found['env_id']}: {episodes_title(found)}, {found['seeds'][0]} to {found['seeds'][-1]}."
-    return Evaluation(Path(folder), title, HEADERS, marked, sentences, found["command"], points)
+    return Evaluation(folder, title, HEADERS, marked, sentences, found["command"], points)
 
 
 def evaluations_of(checkpoint: Path) -> list[Point]:

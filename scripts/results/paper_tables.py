@@ -68,8 +68,18 @@ def read_results(places: Sequence[Path]) -> dict[str, Any]:
     Args:
         places: folders, or files, of this script, of `manicm-ms benchmark`, or of the real-world table.
 
-    Raises ConfigError where there are no results, or two of them hold the same task and method.
+    Raises ConfigError where there are no results, damaged ones, or two of them hold the same task and method.
     """
+    try:
+        return _by_table(places)
+    except (KeyError, TypeError, AttributeError, ValueError) as error:
+        names = ", ".join(map(str, places))
+        raise ConfigError(
+            f"results of {names} lack something ({type(error).__name__}: {error}): run it again"
+        ) from error
+
+
+def _by_table(places: Sequence[Path]) -> dict[str, Any]:
     grids: dict[str, list[Mapping[str, Any]]] = {"main": [], "ddim": [], "prediction": []}
     found: dict[str, Any] = {}
     for place in places:

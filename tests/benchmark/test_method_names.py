@@ -85,6 +85,7 @@ def test_a_list_keeps_the_commas_of_brackets():
         (["simple_dp3[training.steps=1;training.steps=2]"], ConfigError, "each key once"),
         (["simple_dp3[a=1][b=2]"], ConfigError, "a method is written NAME"),
         (["manicm:bc[a=1]"], UnknownNameError, "unknown teacher 'bc'"),
+        (["voxel_manicm:simple_dp3"], ConfigError, "that of simple_dp3 is manicm: use 'manicm'"),
     ],
 )
 def test_what_cannot_be_is_refused_before_anything_runs(names, error, text):

@@ -142,7 +142,8 @@ def test_printed_figures_are_those_of_the_package_and_average_as_the_paper_says(
 
 
 def test_what_this_version_lacks_is_left_out_and_shown_as_missing(script, tables):
-    assert script.known(("dp3", "no_such_method", "manicm:dp3")) == ("dp3", "manicm:dp3")
+    asked = ("dp3", "no_such_method", "manicm:dp3", "dp3_4", "manicm_4:dp3", "no_such_method_4")
+    assert script.known(asked) == ("dp3", "manicm:dp3", "dp3_4", "manicm_4:dp3")
     scale = replace(script.SCALES["paper"], envs=("adroit",), few_envs=("adroit/pen",))
     plans = script.plans(scale, Path("out"), tables.TABLES, "cpu")
     assert set(plans) == {"main", "ddim", "prediction"}
@@ -158,6 +159,7 @@ def test_every_scale_is_a_plan(script, scale):
     found = script.plans(script.SCALES[scale], Path("out"), ("main", "ddim", "prediction"), "cpu")
     assert len(found["main"].env_ids) == (1 if scale == "smoke" else 31)
     assert len(found["ddim"].methods) == 6
+    assert found["main"].methods == script.SCALES[scale].methods, "nothing is left out of the table in silence"
 
 
 def test_bad_results_are_refused_in_one_line(script, tmp_path):
@@ -173,3 +175,7 @@ def test_bad_results_are_refused_in_one_line(script, tmp_path):
     (tmp_path / "results.json").write_text("{}")
     with pytest.raises(ConfigError, match="holds no results"):
         script.main(results=(tmp_path,))
+    for damaged in ('{"cells": []}', '{"cells": [{}]}', '{"main": {}}', '{"main": 1}'):
+        (tmp_path / "results.json").write_text(damaged)
+        with pytest.raises(ConfigError, match="lack something"):
+            script.main(results=(tmp_path,))

@@ -3,6 +3,7 @@
 import io
 import json
 import shutil
+from dataclasses import replace
 
 import pytest
 from point_mass import SPEC, PointMass, Proportional
@@ -10,7 +11,8 @@ from rich.console import Console
 
 from manicm_ms.cli import main
 from manicm_ms.errors import ConfigError, NotComparableError, OutputExistsError, UnknownNameError
-from manicm_ms.evaluation.compare import compare
+from manicm_ms.evaluation.compare import Playing, compare
+from manicm_ms.evaluation.contestants import is_checkpoint
 from manicm_ms.evaluation.evaluate import evaluate_policies
 from manicm_ms.evaluation.play import EnvMaker
 from manicm_ms.evaluation.protocol import CONTROL, STUDENT, TEACHER, EvaluatedPolicy, Protocol
@@ -94,6 +96,31 @@ def test_the_same_teacher_of_two_students_is_shown_once(runs, tmp_path):
     found = compare([runs / "pair", other], tmp_path / "out", console=Console(file=io.StringIO()))
     assert [p["name"] for p in found["policies"]] == ["teacher", "once", "alike", "another student"]
     assert any("teacher of" in remark and "shown once" in remark for remark in found["remarks"])
+
+
+def test_one_checkpoint_evaluated_otherwise_is_no_twin_whatever_its_outcomes(tmp_path):
+    """Under a sparse reward two failing policies have equal records; their network evaluations tell them apart."""
+    quiet, policy = Console(file=io.StringIO()), POLICIES["once"]
+    protocol = Protocol(SPEC.env_id, SEEDS, num_envs=8, repetitions=1, videos=0)
+    envs = EnvMaker(lambda policy, n, _: PointMass(n, policy.chunk), lambda n, _: None)
+    for name in ("teacher", "teacher@4"):
+        played = [replace(policy, name=name, role=TEACHER)]
+        identity = {"policies": [[name, TEACHER, "tt"]]}
+        evaluate_policies(played, protocol, envs, tmp_path / name, identity, "the command", quiet)
+    found = compare([tmp_path / "teacher", tmp_path / "teacher@4"], tmp_path / "out", console=quiet)
+    assert [p["name"] for p in found["policies"]] == ["teacher", "teacher@4"]
+
+
+def test_a_checkpoint_may_be_named_with_its_network_evaluations(tmp_path):
+    (tmp_path / "manifest.json").write_text("{}")
+    assert is_checkpoint(tmp_path.with_name(f"{tmp_path.name}@4"))
+    with pytest.raises(ConfigError, match="does not exist"):
+        is_checkpoint(tmp_path / "none@4")
+
+
+def test_more_episodes_than_anybody_plays_are_refused_before_they_are_listed():
+    with pytest.raises(ConfigError, match="--episodes must be at most 1000000, got 100000000000"):
+        _ = Playing("e", episodes=10**11).seeds
 
 
 def test_common_seeds_alone_are_compared_and_it_is_said(runs, tmp_path):

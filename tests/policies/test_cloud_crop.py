@@ -70,3 +70,9 @@ def test_a_policy_does_not_see_what_lies_outside_and_says_so_in_its_checkpoint(t
 def test_an_empty_box_is_refused():
     with pytest.raises(ConfigError, match="must lie below its high"):
         CropConfig(low=(0.0, 0.0, 0.0), high=(1.0, 0.0, 1.0))
+
+
+def test_a_box_beside_all_demonstrations_is_refused_rather_than_ignored():
+    crop = CloudCrop(CropConfig(low=(0.0, 0.0, 2.0)), SPEC)
+    with pytest.raises(ConfigError, match="their z runs from -1 to 1, the box's from 2 to inf"):
+        crop.ranges({POINT_CLOUD: field_stats(np.array([[[-1.0] * 3, [1.0] * 3]], np.float32), POINT_CLOUD)})

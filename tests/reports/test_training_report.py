@@ -18,6 +18,7 @@ from manicm_ms.demos.collect import collect
 from manicm_ms.errors import CheckpointError, ConfigError
 from manicm_ms.evaluation.evaluate import evaluate
 from manicm_ms.policies.checkpoint import load_checkpoint
+from manicm_ms.reports.evaluations import named_evaluation
 from manicm_ms.reports.training_report import report_training
 from manicm_ms.training.distill import distill
 from manicm_ms.training.log import read_log
@@ -195,3 +196,25 @@ def test_bad_input_is_refused_and_nothing_is_written(runs, tmp_path):
     with pytest.raises(ConfigError, match="no evaluation of this training's checkpoint"):
         report_training(runs / "student", [runs / "evaluated"], tmp_path / "out")
     assert not (tmp_path / "out").exists()
+
+
+@pytest.mark.parametrize(("results", "run"), [("[]", "{}"), ("{}", "[1]"), ('{"policies": [1]}', '{"policies": [1]}')])
+def test_a_damaged_evaluation_is_refused_in_one_line(tmp_path, results, run):
+    (tmp_path / "results.json").write_text(results)
+    (tmp_path / "run.json").write_text(run)
+    with pytest.raises(ConfigError, match="cannot be read as an evaluation's"):
+        named_evaluation(tmp_path, {})
+
+
+def test_a_checkpoint_evaluated_otherwise_is_shown_but_no_point_of_the_training(runs, tmp_path):
+    folder = shutil.copytree(runs / "evaluated", tmp_path / "evaluated")
+    for name in ("results.json", "run.json"):
+        (folder / name).write_text((folder / name).read_text().replace('"teacher"', '"teacher@4"'))
+    results = json.loads((folder / "results.json").read_text())
+    for policy in results["policies"]:
+        policy["role"] = "teacher" if policy["role"] == "teacher@4" else policy["role"]
+    (folder / "results.json").write_text(json.dumps(results))
+    steps = {digest: k for k, (_, _, digest) in enumerate(json.loads((folder / "run.json").read_text())["policies"])}
+    found = named_evaluation(folder, steps)
+    assert any(row[0] == "teacher@4 (this one)" for row in found.rows)
+    assert len(found.points) == 1

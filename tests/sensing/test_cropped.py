@@ -4,6 +4,8 @@ import numpy as np
 import pytest
 import torch
 
+from manicm_ms.envs.simulator import SimulatorConfig
+from manicm_ms.errors import ConfigError
 from manicm_ms.sensing.cropped import CroppedPoints, observe_cropped, voxel_grid
 from manicm_ms.sensing.point_cloud import Box, sample_cloud
 from manicm_ms.spec import POINT_CLOUD, VOXEL_GRID, ObsSpec
@@ -70,3 +72,8 @@ def test_a_device_gives_the_same_bits():
     cropped = CroppedPoints.of_rows([points(700, 6, 1), points(40, 6, 2)])
     there = voxel_grid(cropped.points.cuda(), cropped.valid.cuda(), BOX, SIZE).cpu()
     assert torch.equal(there, voxel_grid(*cropped, BOX, SIZE))
+
+
+def test_a_grid_that_no_memory_holds_is_refused_before_anything_is_made():
+    with pytest.raises(ConfigError, match="voxel_size must be at most 256 cells along a side, got 100000"):
+        SimulatorConfig(voxel_size=100_000)

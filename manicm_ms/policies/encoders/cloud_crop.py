@@ -74,11 +74,17 @@ class CloudCrop(InputTransform):
         return self._cropped(obs)
 
     def ranges(self, stats: Mapping[str, ChannelStats]) -> Mapping[str, ChannelStats]:
-        """See `InputTransform.ranges`."""
+        """See `InputTransform.ranges`; raise ConfigError where the box lies beside all points of the training data."""
         if self._everything or POINT_CLOUD not in stats:
             return stats
         least, most = (np.array(limit, dtype=float) for limit in (stats[POINT_CLOUD].min, stats[POINT_CLOUD].max))
         low, high = self._low.numpy(), self._high.numpy()
+        for axis, name in enumerate("xyz"):
+            if low[axis] > most[axis] or high[axis] < least[axis]:
+                raise ConfigError(
+                    f"the box of inputs.cloud_crop holds no point of the demonstrations: their {name} runs from "
+                    f"{least[axis]:.3g} to {most[axis]:.3g}, the box's from {low[axis]:.3g} to {high[axis]:.3g}"
+                )
         least[:3], most[:3] = np.clip(least[:3], low, high), np.clip(most[:3], low, high)
         return {**stats, POINT_CLOUD: _Range(least, most)}
 
