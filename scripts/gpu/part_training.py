@@ -25,11 +25,12 @@ from manicm_ms.demos.layout import store_path
 from manicm_ms.demos.sequence_dataset import SequenceDataset
 from manicm_ms.demos.store import DemoStore
 from manicm_ms.policies.checkpoint import load_checkpoint, read_manifest, save_checkpoint
+from manicm_ms.policies.configuration import Nested
 from manicm_ms.policies.methods import METHODS
 from manicm_ms.training.distill import distill
 from manicm_ms.training.interrupt import stop_requests
 from manicm_ms.training.optim import FitConfig
-from manicm_ms.training.presets import STUDENT_PRESETS, TEACHER_PRESETS, StudentPreset, TeacherPreset
+from manicm_ms.training.presets import STUDENT_PRESETS, StudentPreset, TeacherPreset, preset_for
 from manicm_ms.training.run_folder import snapshot_folders
 from manicm_ms.training.train import train as train_policy
 
@@ -43,7 +44,6 @@ CAUTION, PATIENCE = 0.9, 1.15  # shares of the time: planned for, and after whic
 MOST_ABOVE_WHOLE = 3.0  # speed of the steps over that of the whole short training, overhead included: more is an error
 SNAPSHOTS = 5  # kept on the way
 SMOKE_BATCH = 8
-SMOKE = {"inputs": {"points": {"max_points": 32}}, "backbone": {"down_dims": (16, 32)}}
 SMOKE_STEPS = (2, 4)
 F = TypeVar("F", TeacherPreset, StudentPreset)
 Train = Callable[[Any, Path], Path]
@@ -61,6 +61,67 @@ class Trained:
 
     checkpoint: Path
     numbers: dict[str, Any]
+
+
+@dataclass(frozen=True)
+class Training:
+    """How a policy is trained.
+
+    Attributes:
+        preset: of as many steps as it wants.
+        train: trains with a preset that is like it but for the steps.
+    """
+
+    preset: Any
+    train: Train
+
+
+def common(args: argparse.Namespace) -> dict[str, Any]:
+    """Return what `train` and `distill` are told alike."""
+    return {
+        "device": args.device,
+        "console": Console(quiet=True),
+        "command": "scripts/gpu/run.py",
+        "snapshots": SNAPSHOTS,
+    }
+
+
+def of_demonstrations(method: str, store: Path, args: argparse.Namespace, changes: Nested | None = None) -> Training:
+    """Return how a method learns from demonstrations with the sizes and batch of the preset `paper`.
+
+    Args:
+        method: its name.
+        store: the demonstrations.
+        args: of the command line.
+        changes: departures from its published sizes; tiny networks know none.
+    """
+    preset = preset_for(method, "paper").with_changes(changes or {})
+    if args.smoke:
+        preset = replace(preset, batch_size=SMOKE_BATCH, size="smoke", changes={})
+
+    def train(shorter: TeacherPreset, out: Path) -> Path:
+        return train_policy(method, store, out, shorter, **common(args))
+
+    return Training(preset, train)
+
+
+def of_teacher(teacher: Path, store: Path, args: argparse.Namespace) -> Training:
+    """Return how the student of a teacher's checkpoint is distilled with the batch of the preset `paper`."""
+    preset = STUDENT_PRESETS.get("paper")
+    if args.smoke:
+        preset = replace(preset, batch_size=SMOKE_BATCH)
+
+    def train(shorter: StudentPreset, out: Path) -> Path:
+        return distill(teacher, store, out, shorter, **common(args))
+
+    return Training(preset, train)
+
+
+def size_of(store: Path, method: str) -> dict[str, int]:
+    """Return how many episodes a store holds, and how many windows they are for a method of the preset `paper`."""
+    with DemoStore.open(store) as opened:
+        windows = SequenceDataset.from_store(opened, METHODS.get(method).chunk_of("paper"))
+        return {"episodes": len(opened), "windows": len(windows)}
 
 
 def shortened(preset: F, steps: int) -> F:
@@ -89,27 +150,38 @@ def share_s(kind: str, budget: Budget, to_come: list[str]) -> float:
     return min(SECONDS[kind], left * SECONDS[kind] / sum(SECONDS[k] for k in to_come))
 
 
-def train_one(train: Train, preset: Any, out: Path, seconds: float, windows: int, smoke: bool) -> Trained:
+def train_one(training: Training, out: Path, seconds: float, windows: int, smoke: bool) -> Trained:
     """Train for about `seconds` and return what came of it.
 
     Raises TimeoutError where not even a few steps fit.
     """
     begin = time.perf_counter()
     timed = SMOKE_STEPS if smoke else (WARM_UP_STEPS, WARM_UP_STEPS + TIMED_STEPS)
-    rate = steps_per_second(train, preset, out.parent / f"{out.name}_speed", timed)
-    left, wanted = seconds - (time.perf_counter() - begin), preset.total_steps(windows)
-    steps = SMOKE_STEPS[1] if smoke else min(wanted, int(rate * CAUTION * left))
+    rate = steps_per_second(training.train, training.preset, out.parent / f"{out.name}_speed", timed)
+    left = seconds - (time.perf_counter() - begin)
+    steps = SMOKE_STEPS[1] if smoke else min(training.preset.total_steps(windows), int(rate * CAUTION * left))
     if steps < WARM_UP_STEPS and not smoke:
         raise TimeoutError(f"{left:.0f} s are too few for {rate:.1f} steps/s")
-    checkpoint = train_until(lambda: train(shortened(preset, steps), out), out, PATIENCE * max(left, OVERHEAD_S))
-    made = read_manifest(checkpoint)["provenance"]
+    made = train_steps(training, out, steps, PATIENCE * max(left, OVERHEAD_S), windows)
+    return Trained(made.checkpoint, {**made.numbers, "steps_per_s": round(rate, 2), "seconds": since(begin)})
+
+
+def since(begin: float) -> float:
+    """Return the seconds since a moment of `time.perf_counter`, for a line."""
+    return round(time.perf_counter() - begin, 1)
+
+
+def train_steps(training: Training, out: Path, steps: int, limit_s: float, windows: int) -> Trained:
+    """Train for `steps` steps, or until `limit_s` is over, and return what came of it; raises as `train_until`."""
+    begin, preset = time.perf_counter(), training.preset
+    checkpoint = train_until(lambda: training.train(shortened(preset, steps), out), out, limit_s)
+    made, wanted = read_manifest(checkpoint)["provenance"], preset.total_steps(windows)
     numbers = {
         "steps": made["steps"],
         "planned_steps": steps,
         "preset_steps": wanted,
         "share": round(made["steps"] / wanted, 6),
-        "steps_per_s": round(rate, 2),
-        "seconds": round(time.perf_counter() - begin, 1),
+        "seconds": since(begin),
         "loss": made.get("final_loss"),
         "batch_size": preset.batch_size,
         "precision": made["precision"],
@@ -192,40 +264,20 @@ class Task:
         self.store = unpacked_store(env_id, args.load, args.work)
         self.folder = args.work / "checkpoints" / env_id
         self.teacher = self.folder / "teacher"  # or where its last snapshot lies
-        self.common = {"device": args.device, "console": Console(quiet=True), "command": "scripts/gpu/part_training.py"}
-        with DemoStore.open(self.store) as store:
-            self.windows = len(SequenceDataset.from_store(store, METHODS.get(POLICY).chunk_of("paper")))
-            self.episodes = len(store)
+        self.size = size_of(self.store, POLICY)
 
     def run(self, kind: str, seconds: float) -> dict[str, Any]:
         """Train one of the two, bring it home and return its numbers."""
-        made = self._train_teacher(seconds) if kind == "teacher" else self._train_student(seconds)
+        if kind == "teacher":
+            training = of_demonstrations(POLICY, self.store, self.args)
+        else:
+            training = of_teacher(self.teacher, self.store, self.args)
+        made = train_one(training, self.folder / kind, seconds, self.size["windows"], self.args.smoke)
+        if kind == "teacher":
+            self.teacher = made.checkpoint
         archive = self.args.out / archive_name(self.env_id, kind)
         size = pack(made.checkpoint, archive, self.args.work)
-        data = {"episodes": self.episodes, "windows": self.windows}
-        return {**data, **made.numbers, "archive": archive.name, "bytes": size}
-
-    def _train_teacher(self, seconds: float) -> Trained:
-        preset = TEACHER_PRESETS.get("paper")
-        if self.args.smoke:
-            preset = replace(preset, batch_size=SMOKE_BATCH, changes=SMOKE)
-
-        def train(shorter: TeacherPreset, out: Path) -> Path:
-            return train_policy(POLICY, self.store, out, shorter, snapshots=SNAPSHOTS, **self.common)
-
-        made = train_one(train, preset, self.folder / "teacher", seconds, self.windows, self.args.smoke)
-        self.teacher = made.checkpoint
-        return made
-
-    def _train_student(self, seconds: float) -> Trained:
-        preset = STUDENT_PRESETS.get("paper")
-        if self.args.smoke:
-            preset = replace(preset, batch_size=SMOKE_BATCH)
-
-        def train(shorter: StudentPreset, out: Path) -> Path:
-            return distill(self.teacher, self.store, out, shorter, snapshots=SNAPSHOTS, **self.common)
-
-        return train_one(train, preset, self.folder / "student", seconds, self.windows, self.args.smoke)
+        return {**self.size, **made.numbers, "archive": archive.name, "bytes": size}
 
 
 def train_all(args: argparse.Namespace, results: Results, budget: Budget) -> bool:

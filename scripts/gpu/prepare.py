@@ -3,6 +3,7 @@
     python scripts/gpu/prepare.py learning      # wheels, demonstrations of two tasks
     python scripts/gpu/prepare.py simulation    # wheels, ManiSkill and SAPIEN without what no part reads, loaders
     python scripts/gpu/prepare.py software      # a software driver, for a machine whose own makes no pictures
+    python scripts/gpu/prepare.py families      # wheels, demonstrations of one task with voxel grids
 
 Wheels come from pip's configured index, in the versions of constraints.txt; packages of the system from apt. What is
 there already is kept. The exit status is 1 where tree and load are more than travels. See docs/gpu_kit.md.
@@ -42,6 +43,7 @@ class Load:
         wheels: distributions, whole.
         stripped: distribution -> patterns of the files in its wheel that stay behind.
         stores: environment ids whose demonstrations go along.
+        collected: options of `manicm-ms collect` for them.
         debs: packages of the system that are unpacked beside the tree there.
         software: whether it is the software driver for Vulkan, which does not fit beside the rest.
     """
@@ -49,6 +51,7 @@ class Load:
     wheels: tuple[str, ...]
     stripped: Mapping[str, tuple[str, ...]]
     stores: tuple[str, ...] = ()
+    collected: tuple[str, ...] = ()
     debs: tuple[str, ...] = ()
     software: bool = False
 
@@ -71,6 +74,12 @@ LOADS = {
         wheels=(*_BASE, "trimesh", "fpsample", *_MANI_SKILL), stripped=_NOT_READ, debs=(*_LOADERS, *_X11)
     ),
     "software": Load(wheels=(), stripped={}, software=True),
+    "families": Load(
+        wheels=(*_BASE, *_LEARNING),
+        stripped={},
+        stores=("adroit/hammer",),
+        collected=("--extras", "voxel_grid", "--voxel-size", "64"),
+    ),
 }
 
 
@@ -124,14 +133,17 @@ def gather_wheels(load: Load, folder: Path) -> None:
 
 
 def gather_stores(load: Load, folder: Path) -> None:
-    """Collect the demonstrations that are not there yet and pack each store as one file."""
+    """Collect the demonstrations that are not there yet and pack each store as one file.
+
+    Each load has stores of its own: the same task's may hold more in one than in another.
+    """
     for env_id in load.stores:
-        packed, store = folder / "stores" / f"{env_id}.zip", KIT / "stores" / f"{env_id}.zarr"
+        packed, store = folder / "stores" / f"{env_id}.zip", KIT / "stores" / folder.name / f"{env_id}.zarr"
         if packed.is_file():
             continue
         print(f"collecting {EPISODES} demonstrations of {env_id}", flush=True)
         command = ["-m", "manicm_ms.cli", "collect", env_id, "--episodes", str(EPISODES), "--out", str(store)]
-        run([sys.executable, *command])
+        run([sys.executable, *command, *load.collected])
         packed.parent.mkdir(parents=True, exist_ok=True)
         with zipfile.ZipFile(packed, "w", zipfile.ZIP_STORED) as archive:
             for file in sorted(p for p in store.rglob("*") if p.is_file()):

@@ -67,6 +67,34 @@ def training(lines: Sequence[Line]) -> str:
     return f"## Trainings\n\n{table(columns, mine)}" if mine else ""
 
 
+def families(lines: Sequence[Line]) -> str:
+    """Return the section of part 4."""
+    mine = [line for line in lines if line["part"] == "families"]
+    trained = [line for line in mine if "steps" in line]
+    if not trained:
+        return ""
+    columns: dict[str, Callable[[Line], Any]] = {
+        "method": lambda x: x["method"],
+        "steps": lambda x: x["steps"],
+        "of the preset's": lambda x: f"{x['preset_steps']} ({x['share']:.1%})",
+        "steps/s, alone": lambda x: x["steps_per_s"],
+        "loss": lambda x: "-" if x["loss"] is None else f"{x['loss']:.2e}",
+        "archive": lambda x: f"{x['archive']}, {x['bytes']} bytes" if "archive" in x else "-",
+    }
+    first = trained[0]
+    used = "at once" if first["at_once"] else "one after another"
+    intro = (
+        f"{first['task']}, {first['episodes']} demonstrations, batch {first['batch_size']}; "
+        f"{first['planned_steps']} steps planned for each, trained {used}. Losses of different methods do not compare."
+    )
+    for rounds in (line["steps_of_all_per_s"] for line in mine if "used" in line):
+        took = {way: 1000 / rate for way, rate in rounds.items()}
+        intro += (
+            f" A step of all takes {took['one_after_another']:.0f} ms one after another, {took['at_once']:.0f} at once."
+        )
+    return f"## Families of methods\n\n{intro}\n\n{table(columns, trained)}"
+
+
 def simulation(lines: Sequence[Line]) -> str:
     """Return the section of part 3."""
     mine = [line for line in lines if line["part"] == "simulation"]
@@ -101,7 +129,7 @@ def failures(lines: Sequence[Line]) -> str:
 
 def report(lines: Sequence[Line]) -> str:
     """Return the page."""
-    sections = [section(lines) for section in (latency, training, simulation, failures)]
+    sections = [section(lines) for section in (latency, training, families, simulation, failures)]
     return "\n\n".join(["# What the GPU kit measured", *filter(None, sections)]) + "\n"
 
 

@@ -2,6 +2,7 @@
 
     python3 scripts/gpu/run.py learning --load .gpu_kit/learning --out OUT        # parts 1 and 2, 8 minutes at most
     python3 scripts/gpu/run.py simulation --load .gpu_kit/simulation --out OUT    # part 3, 4 minutes at most
+    python3 scripts/gpu/run.py families --load .gpu_kit/families --out OUT        # part 4, 5 minutes at most
 
 Every result is a line of OUT/results.jsonl as soon as it is known. A part that fails or outlasts its time is a line
 too, and the next one goes on. `--smoke` shows on any machine that everything runs. See docs/gpu_kit.md.
@@ -45,9 +46,10 @@ LOADS: dict[str, tuple[Part, ...]] = {
         Part("training", ("part_training.py",), 310.0),
     ),
     "simulation": (Part("simulation", ("part_simulation.py",), 210.0),),
+    "families": (Part("families", ("part_families.py",), 270.0),),
 }
 UNPACKING_S = 30.0  # allowed for what comes before the first part
-LIMIT_S = {"learning": 480.0, "simulation": 240.0}
+LIMIT_S = {"learning": 480.0, "simulation": 240.0, "families": 300.0}
 MARGIN_S = 5.0  # a part knows of less time than it has, so that it ends by itself
 
 
