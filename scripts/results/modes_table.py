@@ -4,18 +4,21 @@
 
 The demonstrations hold both sides from the very same start states, so that what is seen does not tell the side. For
 each policy: success, how many of its successes go to either side, and the energy distance between its approaches and
-the demonstrated ones (metres along y that the commands go before the push).
+the demonstrated ones (metres along y that the commands go before the push). The side is that of the push: the sign of
+what the commands go along y after the approach; the approach alone does not tell it where the block lies far off.
 """
 
 from __future__ import annotations
 
 import json
+from collections.abc import Iterable
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 import tyro
 from scipy.stats import energy_distance
-from sides_table import APPROACH_STEPS, approach
+from sides_table import APPROACH_STEPS
 
 from manicm_ms.demos.store import DemoStore
 from manicm_ms.evaluation.intervals import rate_interval
@@ -25,22 +28,34 @@ from manicm_ms.robots.ur3e_ag95 import TCP_STEP
 
 Y = 1  # index of the translation along y in an action
 HEAD = (
-    "| policy | NFE | success | 95 % interval | successes to -y first, +y first | rarer side | energy distance | "
+    "| policy | NFE | success | 95 % interval | successes pushed to -y, +y | rarer side | energy distance | "
     "one decision |\n|---|---|---|---|---|---|---|---|"
 )
 
 
-def demonstrated(stores: tuple[Path, ...]) -> np.ndarray:
-    """Return how far each demonstration's commands move along y before the push, m."""
+class Ways(NamedTuple):
+    """How far the commands of some episodes go along y, m, each (E,): before the push, and from then on."""
+
+    approach: np.ndarray
+    push: np.ndarray
+
+
+def ways_of(episodes: Iterable[np.ndarray]) -> Ways:
+    """Return the ways of episodes' actions, (L, Da) each."""
+    moved = [actions[:, Y] * TCP_STEP for actions in episodes]
+    approach, push = (
+        [m[part].sum() for m in moved] for part in (slice(None, APPROACH_STEPS), slice(APPROACH_STEPS, None))
+    )
+    return Ways(np.array(approach), np.array(push))
+
+
+def demonstrated(stores: tuple[Path, ...]) -> Ways:
+    """Return the ways of the demonstrations."""
     found = []
     for path in stores:
         with DemoStore.open(path) as store:
-            begin = 0
-            for end in store.episode_ends:
-                actions = np.asarray(store.action[begin:end])[:APPROACH_STEPS]
-                found.append(float(actions[:, Y].sum() * TCP_STEP))
-                begin = int(end)
-    return np.array(found)
+            found += np.split(np.asarray(store.action[: store.num_frames]), store.episode_ends[:-1])
+    return ways_of(found)
 
 
 def episodes_of(report: Path, policy: str) -> list[EpisodeResult]:
@@ -49,12 +64,12 @@ def episodes_of(report: Path, policy: str) -> list[EpisodeResult]:
     return sorted((EpisodeResult.from_record(json.loads(line)) for line in lines), key=lambda e: e.seed)
 
 
-def row(name: str, played: list[EpisodeResult], demos: np.ndarray, nfe: int, decision_ms: float) -> str:
+def row(name: str, played: list[EpisodeResult], demos: Ways, nfe: int, decision_ms: float) -> str:
     """Return the table's line of a policy."""
-    ways = np.array([approach(episode) for episode in played])
+    ways = ways_of(episode.actions.reshape(-1, episode.actions.shape[-1]) for episode in played)
     won = np.array([episode.success for episode in played])
     low, high = rate_interval(int(won.sum()), len(won))
-    minus, plus = int((ways[won] < 0).sum()), int((ways[won] > 0).sum())
+    minus, plus = int((ways.push[won] < 0).sum()), int((ways.push[won] > 0).sum())
     rarer = f"{100 * min(minus, plus) / (minus + plus):.0f} %" if minus + plus else "-"
     cells = [
         name,
@@ -63,7 +78,7 @@ def row(name: str, played: list[EpisodeResult], demos: np.ndarray, nfe: int, dec
         f"{100 * low:.1f} to {100 * high:.1f} %",
         f"{minus}, {plus}",
         rarer,
-        f"{energy_distance(ways, demos):.3f}",
+        f"{energy_distance(ways.approach, demos.approach):.3f}",
         f"{decision_ms:.1f} ms",
     ]
     return f"| {' | '.join(cells)} |"
@@ -77,7 +92,7 @@ def main(reports: tyro.conf.Positional[tuple[Path, ...]], demos: tuple[Path, ...
         demos: stores that the policies were trained on.
     """
     shown = demonstrated(demos)
-    print(f"{len(shown)} demonstrations: {(shown < 0).sum()} go to -y first, {(shown > 0).sum()} to +y\n")
+    print(f"{len(shown.push)} demonstrations: {(shown.push < 0).sum()} push to -y, {(shown.push > 0).sum()} to +y\n")
     print(HEAD)
     for report in reports:
         for policy in json.loads((report / "results.json").read_text())["policies"]:
