@@ -19,7 +19,6 @@ from kit import Budget, Results, last_error, part_arguments, results_of
 from part_training import (
     CAUTION,
     OVERHEAD_S,
-    PATIENCE,
     SMOKE_STEPS,
     Trained,
     Training,
@@ -223,15 +222,17 @@ class Families:
         methods: Sequence[str],
         folder: Path,
         steps: int,
-        limits_s: Mapping[str, float],
+        kept_s: Mapping[str, float],
         submit: Submit,
         at_most: int,
     ) -> Iterator[tuple[str, Future[Any]]]:
-        """Train methods, a folder each, and yield them as they finish; none has more time than is left."""
+        """Train methods, a folder each, and yield them as they finish.
+
+        A training may last for what is left, less what `kept_s` says is kept for others.
+        """
 
         def start(method: str, teacher: Path | None) -> Future[Any]:
-            left_s = self.budget.left_s - OVERHEAD_S
-            limit_s, out = min(limits_s.get(method, left_s), left_s), folder / method
+            limit_s, out = self.budget.left_s - OVERHEAD_S - kept_s.get(method, 0.0), folder / method
             return submit(method, train_family, method, teacher, out, self.args, steps, limit_s, self.size["windows"])
 
         return results_in_turn(methods, at_most, start)
@@ -243,10 +244,11 @@ class Families:
         if steps < FEWEST_STEPS and not self.args.smoke:
             self.results.write(PART, name="plan", failed=f"{left_s:.0f} s are too few: {steps} steps of each")
             return False
-        rates = speeds if at_most == 1 else dict.fromkeys(methods, all_per_s)
-        limits_s = {method: OVERHEAD_S + PATIENCE * steps / rates[method] for method in methods}
-        succeeded = True
-        for method, future in self.trained(methods, self.folder, steps, limits_s, submit, at_most):
+        kept_s, succeeded = dict[str, float](), True
+        if at_most == 1:  # a late one may use up what was set aside, but not the time of those after it
+            took = [OVERHEAD_S + steps / speeds[method] for method in methods]
+            kept_s = {method: sum(took[k + 1 :]) for k, method in enumerate(methods)}
+        for method, future in self.trained(methods, self.folder, steps, kept_s, submit, at_most):
             line = {"name": "trained", "method": method, "task": TASK, "at_once": at_most > 1}
             try:
                 made = self.brought_home(method, *future.result())
