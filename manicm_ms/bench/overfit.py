@@ -32,6 +32,7 @@ from manicm_ms.policies.encoders.transform import TRANSFORMS
 from manicm_ms.policies.methods import METHODS, methods_of
 from manicm_ms.policies.parameter_counts import TOTAL, parameters_by_part
 from manicm_ms.policies.policy import example_observations
+from manicm_ms.training.demonstrations import spec_of
 from manicm_ms.training.distill import distill
 from manicm_ms.training.log import read_log
 from manicm_ms.training.objectives.objective import DISTILLATIONS
@@ -81,12 +82,17 @@ def bench(options: Options, command: str, console: Console | None = None) -> boo
 
     Raises:
         UnknownNameError: no such method, size or teacher.
-        ConfigError: no teacher fits the student.
+        ConfigError: no teacher fits the student, or one is named for what has none.
+        StoreError: a store is not there.
     """
     METHODS.get(options.method)
     if options.size not in SIZES:
         raise UnknownNameError("size", options.size, SIZES)
-    teacher = teacher_of(options.method, options.size, options.teacher) if learns_from_teacher(options.method) else None
+    student = learns_from_teacher(options.method)
+    if options.teacher is not None and not student:
+        raise ConfigError(f"{options.method} learns from demonstrations alone: leave --teacher out")
+    teacher = teacher_of(options.method, options.size, options.teacher) if student else None
+    _ = spec_of(options.data) if options.data else None  # refuses a store that is not there before anything is made
     console = console or Console()
     data = options.data or (_collected(options, teacher or options.method, console),)
     found = measure(options, data, teacher, console)

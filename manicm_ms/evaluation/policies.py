@@ -107,9 +107,10 @@ def with_users(policies: Sequence[EvaluatedPolicy], sources: Sequence[str], spec
 
 
 def _free_name(name: str, taken: Collection[str]) -> str:
-    """Return `name`, with a number behind it where it is taken."""
+    """Return `name`, with a number behind it where it, or the name of its files, is taken."""
+    files = {slug(other) for other in taken}
     numbered = (f"{name} {k}" for k in count(2))
-    return name if name not in taken else next(n for n in numbered if n not in taken)
+    return name if slug(name) not in files else next(n for n in numbered if slug(n) not in files)
 
 
 def role_of(policy: ActionPolicy) -> str:

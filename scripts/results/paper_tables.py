@@ -73,10 +73,8 @@ def read_results(places: Sequence[Path]) -> dict[str, Any]:
     try:
         return _by_table(places)
     except (KeyError, TypeError, AttributeError, ValueError) as error:
-        names = ", ".join(map(str, places))
-        raise ConfigError(
-            f"results of {names} lack something ({type(error).__name__}: {error}): run it again"
-        ) from error
+        names, why = ", ".join(map(str, places)), f"{type(error).__name__}: {error}"
+        raise ConfigError(f"results of {names} lack something ({why}): run it again") from error
 
 
 def _by_table(places: Sequence[Path]) -> dict[str, Any]:

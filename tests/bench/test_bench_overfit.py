@@ -71,7 +71,13 @@ def test_what_reads_clouds_needs_nothing_else_of_a_store():
 
 
 def test_unknown_names_are_refused_before_anything_is_made(told, capsys, tmp_path):
-    for words in (["nonsense"], ["manicm", "--teacher", "bc_gmm_3d"], ["dp3", "--size", "huge"]):
+    for words in (
+        ["nonsense"],
+        ["manicm", "--teacher", "bc_gmm_3d"],
+        ["dp3", "--size", "huge"],
+        ["dp3", "--teacher", "simple_dp3"],
+        ["dp3", "--data", str(tmp_path / "no.zarr")],
+    ):
         with pytest.raises(SystemExit) as end:
             main(["bench", "overfit", *words, "--folder", str(tmp_path / "x")])
         assert end.value.code == 2

@@ -174,6 +174,12 @@ def test_a_state_of_another_form_is_refused(tmp_path):
         load_user_policy(source, SPEC)
 
 
+def test_names_that_would_share_their_files_are_told_apart(tmp_path):
+    sources = [write(tmp_path, MINIMAL.replace("class Walk:", f"class Walk:\n        name = {n!r}"), f) for n, f in
+               (("my policy", "a.py"), ("my-policy", "b.py"))]  # fmt: skip
+    assert [p.name for p in with_users([], sources, SPEC)] == ["my policy", "my-policy 2"]
+
+
 def test_the_form_of_the_option_is_told_and_no_policy_at_all_is_refused(tmp_path):
     with pytest.raises(UserPolicyError, match=r"must name a file and a function in it, as in FILE\.py:FUNCTION"):
         load_user_policy(str(tmp_path / "mine.py"), SPEC)
