@@ -28,6 +28,7 @@ from manicm_ms.benchmark.run import benchmark
 from manicm_ms.envs.backends import default_num_envs
 from manicm_ms.errors import ManicmError, UnknownNameError
 from manicm_ms.evaluation.plots import Panel, curves_plot
+from manicm_ms.machine.devices import resolve_device
 from manicm_ms.paths import write_json, write_text
 
 sys.path.insert(0, str(Path(__file__).resolve().parent / "results"))
@@ -177,6 +178,7 @@ def main(
     if results:
         found = read_results(results)
     else:
+        resolve_device(device)  # before anything is collected
         count = default_num_envs() if processes is None else processes
         found = run(chosen, out, only, count, device, command, Console(stderr=True))
     text = document(found, only, chosen.teacher, command)

@@ -13,8 +13,9 @@ from rich.console import Console
 
 from manicm_ms.benchmark.method_names import MethodName, folder_name, read_name
 from manicm_ms.errors import ConfigError, UnknownNameError
+from manicm_ms.policies.action_policy import Parts, keys_read, read_parts
 from manicm_ms.policies.configuration import parse_overrides
-from manicm_ms.policies.methods import METHODS, STUDENT, head_with_nfe, methods_of, student_name
+from manicm_ms.policies.methods import METHODS, methods_of, student_name
 from manicm_ms.training.optim import FitConfig
 from manicm_ms.training.presets import CHUNK, STUDENT_PRESETS, StudentPreset, TeacherPreset, preset_for
 
@@ -121,10 +122,21 @@ class Trained(Method):
 
     def reads(self, preset: str, spec: EnvSpec) -> tuple[str, ...]:
         """See `Method.reads`."""
-        from manicm_ms.policies.action_policy import keys_read
-
         config = self.preset(preset).configuration(self.row)
         return keys_read({key: value for key, value in config.items() if key != CHUNK}, spec)
+
+    def parts(self) -> Parts:
+        """Return the parts of its policy at the published size, with its overrides."""
+        config = self.preset("paper").configuration(self.row)
+        return read_parts({key: value for key, value in config.items() if key != CHUNK})
+
+    def require_nfe(self, nfe: int) -> None:
+        """Raise ConfigError where its network cannot be evaluated `nfe` times a decision."""
+        kind, config = self.parts().head
+        if kind.nfe_field is not None:
+            replace(config, **{kind.nfe_field: nfe})
+        elif nfe != (own := METHODS.get(self.row).nfe):
+            raise ConfigError(f"{self.name} takes {own} network evaluations a decision and no other number, got {nfe}")
 
     def train(self, out: Path, source: Path | None, training: Training) -> None:
         """See `Method.train`."""
@@ -188,6 +200,12 @@ class Student(Method):
         """See `Method.preset`."""
         start = replace(STUDENT_PRESETS.get(size), nfe=1)
         return start.with_changes(parse_overrides(read_name(self.name).overrides))
+
+    def require_nfe(self, nfe: int) -> None:
+        """Raise ConfigError where its network cannot be evaluated `nfe` times a decision."""
+        most = self.teacher.parts().head[1].num_train_timesteps // self.preset("paper").solver_stride
+        if not 1 <= nfe <= most:
+            raise ConfigError(f"{self.name}: nfe={nfe} must lie between 1 and num_solver_steps={most}")
 
     def train(self, out: Path, source: Path | None, training: Training) -> None:
         """See `Method.train`."""
@@ -259,8 +277,8 @@ def method_names() -> tuple[str, ...]:
 def parse_methods(names: Sequence[str]) -> tuple[Method, ...]:
     """Return the methods of these names, in their order.
 
-    A student is distilled from the one teacher among the names that its row is made for; manicm else from any that is
-    named. With several, "manicm:dp3" says from which, and with none it is the first that its row names.
+    A student is distilled from the one teacher among the names whose student it is. With several, "manicm:dp3" says
+    from which, and with none it is the first that its row names.
     A number behind a name is that of network evaluations: "simple_dp3_4" plays with the checkpoint of simple_dp3.
     Brackets hold overrides, as `--set` takes them, separated by semicolons: "simple_dp3[head.prediction_type=epsilon]",
     "manicm[training.solver_stride=20]:dp3[training.steps=3000]".
@@ -301,7 +319,7 @@ def _with_steps(name: MethodName, kind: str, nfe: int, teachers: Sequence[Method
     if isinstance(method, OneStep):
         raise ConfigError(f"{kind} is evaluated once a decision: to evaluate a teacher {nfe} times write TEACHER_{nfe}")
     assert isinstance(method, Trained | Student)
-    head_with_nfe(kind, nfe)
+    method.require_nfe(nfe)
     return Steps(str(name), method, nfe)
 
 
@@ -309,15 +327,13 @@ def _teacher_of(name: MethodName, teachers: Sequence[MethodName]) -> Trained:
     """Return what a method is made from: the teacher that it names, or that follows from those named beside it."""
     kind = name.kind
     own = METHODS.get(kind).teachers if kind != ONE_STEP else ()
-    any_teacher = kind in (ONE_STEP, STUDENT)
-    likely = [str(t) for t in teachers if t.kind in own] or ([str(t) for t in teachers] if any_teacher else [])
+    likely = [str(t) for t in teachers if kind in (ONE_STEP, student_name(t.kind))]
     if not name.teacher and len(likely) > 1:
         raise ConfigError(f"{kind} of which teacher? write {' or '.join(f'{kind}:{t}' for t in likely)}")
     chosen = read_name(name.teacher or (likely[0] if likely else own[0] if own else DEFAULT_TEACHER))
     possible = methods_of("teacher")
     if chosen.kind not in possible:
         raise UnknownNameError("teacher", chosen.kind, possible)
-    if own and not any_teacher and chosen.kind not in own:
-        made = student_name(chosen.kind)
+    if kind not in (ONE_STEP, made := student_name(chosen.kind)):
         raise ConfigError(f"{kind} is the student of {' or '.join(own)}, that of {chosen.kind} is {made}: use {made!r}")
     return Trained(str(chosen))

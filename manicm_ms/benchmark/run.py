@@ -48,7 +48,7 @@ def benchmark(
     """
     console = console or Console()
     if processes < 0:
-        raise ConfigError(f"--processes must be at least 1, got {processes}")
+        raise ConfigError(f"--processes must be at least 0, got {processes}")
     for env_id in plan.env_ids:
         entry = ENVS.get(env_id)
         entry.require(SimulatorConfig(obs_preset=plan.obs_preset))

@@ -111,7 +111,7 @@ def render_comparison(found: Mapping[str, Any]) -> str:
     """Return the comparison as Markdown."""
     seeds = found["seeds"]
     lines = [
-        f"# {found['env_id']}: {counted(len(found['policies']), 'policy').replace('policys', 'policies')} on the same "
+        f"# {found['env_id']}: {counted(len(found['policies']), 'policy')} on the same "
         f"{counted(len(seeds), 'start state')}",
         "",
         *(f"- **{pair['verdict']}**: {pair['sentence']}" for pair in found["pairs"]),

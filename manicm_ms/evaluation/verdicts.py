@@ -74,15 +74,24 @@ def sentence(first: str, second: str, found: StateComparison, verdict: Verdict, 
         return f"Nothing can be said about {second} and {first}: no start state was played by both without a crash."
     numbers = difference_text(found)
     if verdict.word == UNDERPOWERED:
+        if found.ci95.low > 0 or found.ci95.high < 0:
+            hint = f"{counted(found.n, 'start state')} hint at a difference between {second} and {first}: {numbers}"
+            observed = verdict.needed is not None and verdict.needed.supposing != EQUAL
+            more = needed_sentence(found, verdict.needed, second, margin) if observed else "Play more episodes."
+            return f"{hint}, which {_test(tests)} does not confirm. {more}"
         settled = f"{counted(found.n, 'start state')} cannot tell {second} from {first}: {numbers}."
         return f"{settled} {needed_sentence(found, verdict.needed, second, margin)}".strip()
-    test = f"McNemar's exact test{'' if tests == 1 else f' corrected for {tests} comparisons'}"
+    test = _test(tests)
     if verdict.word == BETTER:
         return f"{second} is better than {first} by {test}: {numbers}."
     if verdict.word == WORSE:
         mild = f", though by less than {points}" if verdict.within_margin else ""
         return f"{second} is worse than {first} by {test}{mild}: {numbers}."
     return f"{second} is not worse than {first} by more than {points}: {numbers}."
+
+
+def _test(tests: int) -> str:
+    return f"McNemar's exact test{'' if tests == 1 else f' corrected for {tests} comparisons'}"
 
 
 def difference_text(found: StateComparison) -> str:

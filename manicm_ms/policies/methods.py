@@ -242,19 +242,3 @@ def student_of(teacher: ActionPolicy, nfe: int = 1, **consistency: Any) -> Actio
         raise ConfigError(f"{teacher.name} cannot be distilled: give one of {', '.join(methods_of('teacher'))}")
     made = ConsistencyHead.from_teacher(head, nfe, **consistency)
     return copy.deepcopy(teacher.with_head(made, student_name(teacher.name)))
-
-
-def head_with_nfe(method: str, nfe: int) -> Nested:
-    """Return the section `head` with which a method evaluates its network `nfe` times a decision.
-
-    Raises:
-        UnknownNameError: no such method.
-        ConfigError: it cannot.
-    """
-    row = METHODS.get(method)
-    field_ = HEADS.get(described(row.head)[NAME]).nfe_field
-    if field_ is None and nfe != row.nfe:
-        raise ConfigError(f"{method} takes {row.nfe} network evaluations a decision and no other number, got {nfe}")
-    changes = {} if field_ is None else {field_: nfe}
-    row.configuration(changes={"head": changes})  # raises where the number is out of range
-    return changes

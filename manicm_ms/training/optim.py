@@ -15,6 +15,9 @@ from torch.optim.swa_utils import AveragedModel
 
 from manicm_ms.errors import ConfigError, require_at_least
 
+MOST_STEPS = 10**9
+"""Steps, or epochs, of a training: more is a slip of the keyboard."""
+
 
 @dataclass(frozen=True, kw_only=True)
 class FitConfig:
@@ -53,6 +56,8 @@ class FitConfig:
             raise ConfigError(f"give steps or epochs, one of the two: got steps={self.steps}, epochs={self.epochs}")
         length = {"epochs": self.epochs} if self.steps is None else {"steps": self.steps}
         require_at_least(1, **length, batch_size=self.batch_size, threads=self.threads)
+        if max(length.values()) > MOST_STEPS:
+            raise ConfigError(f"{next(iter(length))} must be at most {MOST_STEPS}, got {max(length.values())}")
         require_at_least(1, log_every=self.log_every, save_every=self.save_every)
         if self.warmup_steps < 0 or self.learning_rate <= 0 or self.weight_decay < 0:
             raise ConfigError("learning_rate must be positive, warmup_steps and weight_decay not negative")

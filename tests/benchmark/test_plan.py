@@ -34,7 +34,7 @@ def test_a_student_is_made_from_the_teacher_of_its_row():
     names = ["simple_dp3", "pocket_dp3", "manicm", "pocket_manicm"]
     assert [m.made_from.name for m in parse_methods(names)[2:]] == ["simple_dp3", "pocket_dp3"]
     assert parse_methods(["dp3", "pocket_manicm"])[1] == Student("pocket_manicm", Trained("pocket_dp3"))
-    assert parse_methods(["pocket_dp3", "manicm"])[1] == Student("manicm", Trained("pocket_dp3"))
+    assert parse_methods(["pocket_dp3", "manicm"])[1] == Student("manicm", Trained("simple_dp3"))
 
 
 def test_a_number_behind_a_name_is_that_of_network_evaluations():
@@ -55,6 +55,9 @@ def test_a_number_behind_a_name_is_that_of_network_evaluations():
         (["simple_dp3_101"], ConfigError, "num_inference_steps=101 must lie between 1"),
         (["manicm_11"], ConfigError, "nfe=11 must lie between 1 and num_solver_steps=10"),
         (["bc_gmm_3d_2"], ConfigError, "bc_gmm_3d takes 1 network evaluations a decision"),
+        (["simple_dp3_50[head.num_train_timesteps=20]"], ConfigError, "num_train_timesteps=20"),
+        (["manicm_8[training.solver_stride=20]"], ConfigError, "nfe=8 must lie between 1 and num_solver_steps=5"),
+        (["dp", "manicm:dp"], ConfigError, "that of dp is image_manicm: use 'image_manicm'"),
         (["one_step_4"], ConfigError, "write TEACHER_4"),
         (["simple_dp3_0"], UnknownNameError, "unknown method 'simple_dp3_0'"),
         ([], ConfigError, "name each method once"),
@@ -154,7 +157,7 @@ def test_students_of_two_teachers_have_folders_of_their_own():
     [
         (("simple_dp3", "one_step", "manicm"), ()),
         (("dp", "one_step"), ("image",)),
-        (("simple_dp3", "manicm:voxel_dp", "dp"), ("image", "voxel_grid")),
+        (("simple_dp3", "voxel_manicm_2", "dp"), ("image", "voxel_grid")),
     ],
 )
 def test_what_the_methods_read_is_collected_and_a_store_that_holds_more_is_taken(tmp_path, methods, extras):

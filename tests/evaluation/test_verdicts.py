@@ -111,6 +111,15 @@ def test_the_first_conclusion_that_holds_stands():
     assert judge(found, 10 * found.p, 0.05).word == NOT_WORSE, "corrected for ten"
 
 
+def test_a_test_and_an_interval_that_disagree_are_told_so():
+    """Five pairs for A alone and none for B: McNemar's p is 1/16, and Tango's interval leaves 0 out."""
+    found = compare_states(pairs(45, 5, 0, 0))
+    assert found.ci95.high < 0
+    said = sentence("A", "B", found, judge(found, found.p, 0.05), 0.05)
+    assert said.startswith("50 start states hint at a difference between B and A: -10.0 points")
+    assert said.endswith("which McNemar's exact test does not confirm. Play more episodes.")
+
+
 def test_sentences_are_plain_and_say_how_many_episodes_would_do():
     def told(*cells):
         found = compare_states(pairs(*cells))

@@ -105,6 +105,7 @@ def test_epochs_become_steps():
         {"steps": 10, "epochs": 1},
         {"steps": 0},
         {"steps": 100, "warmup_steps": 100},
+        {"steps": 10**9 + 1},
         {"steps": 200, "batch_size": 0},
         {"steps": 200, "clip_norm": 0.0},
         {"steps": 200, "learning_rate": 0.0},
