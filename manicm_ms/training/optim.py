@@ -56,8 +56,8 @@ class FitConfig:
             raise ConfigError(f"give steps or epochs, one of the two: got steps={self.steps}, epochs={self.epochs}")
         length = {"epochs": self.epochs} if self.steps is None else {"steps": self.steps}
         require_at_least(1, **length, batch_size=self.batch_size, threads=self.threads)
-        if max(length.values()) > MOST_STEPS:
-            raise ConfigError(f"{next(iter(length))} must be at most {MOST_STEPS}, got {max(length.values())}")
+        if (self.steps or self.epochs or 0) > MOST_STEPS:
+            raise ConfigError(f"{next(iter(length))} must be at most {MOST_STEPS}, got {self.steps or self.epochs}")
         require_at_least(1, log_every=self.log_every, save_every=self.save_every)
         if self.warmup_steps < 0 or self.learning_rate <= 0 or self.weight_decay < 0:
             raise ConfigError("learning_rate must be positive, warmup_steps and weight_decay not negative")
