@@ -162,7 +162,7 @@ while True:
     shutil.rmtree(work, ignore_errors=True)
     shutil.copytree(base, work)
     status = in_child(append_until_killed, moment)
-    assert in_child(check, [3, 1, 4, 15, 9, 2]) == 0, f"broken by a kill at file operation {moment}"
+    assert in_child(check, [3, 1]) == 0, f"broken by a kill at file operation {moment}"
     if status == 0:
         break
     assert os.WTERMSIG(status) == 9
@@ -172,7 +172,7 @@ print(moment)
 
 
 def test_a_kill_at_any_file_operation_leaves_what_was_committed(tmp_path):
-    base = make_store(tmp_path / "base.zarr", SEEDS)
+    base = make_store(tmp_path / "base.zarr", SEEDS[:2])
     done = subprocess.run(
         [sys.executable, "-c", KILLED_APPEND, str(base), str(tmp_path / "work.zarr")],
         env=os.environ | {"PYTHONPATH": str(HERE)},
