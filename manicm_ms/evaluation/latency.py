@@ -15,7 +15,7 @@ from manicm_ms.errors import ConfigError, OutputExistsError
 from manicm_ms.evaluation.decisions import Decider
 from manicm_ms.machine.devices import torch_threads
 from manicm_ms.paths import write_json
-from manicm_ms.policies.policy import example_observations
+from manicm_ms.policies.policy import typical_observations
 
 
 class Latency(NamedTuple):
@@ -69,7 +69,7 @@ def measure_latency(
         raise ConfigError(
             f"repetitions={repetitions} and threads={threads} must be at least 1, warmup={warmup} at least 0"
         )
-    observations = {name: example_observations(p, seed=seed) for name, p in policies.items()}
+    observations = {name: typical_observations(p, seed=seed) for name, p in policies.items()}
     times: dict[str, list[float]] = {name: [] for name in policies}
     for policy in policies.values():
         policy.eval()

@@ -167,6 +167,22 @@ def example_observations(policy: Observer, batch: int = 1, seed: int = 0) -> dic
     return found
 
 
+def typical_observations(policy: Observer, batch: int = 1, seed: int = 0) -> dict[str, Tensor]:
+    """Return example observations within the ranges that the policy learnt from; arguments as `example_observations`.
+
+    Far outside of them a network may answer with infinity, for which its decisions are refused. A policy without a
+    normalizer gets the examples as they are.
+    """
+    from manicm_ms.policies.normalizer import Normalizer  # which imports this module
+
+    found = example_observations(policy, batch, seed)
+    if isinstance(normalizer := getattr(policy, "normalizer", None), Normalizer):
+        device = next(normalizer.buffers()).device
+        for key in found.keys() & set(normalizer.fields):
+            found[key] = normalizer.unnormalize(key, 2 * found[key].to(device) - 1).cpu()
+    return found
+
+
 def starting_noise(
     policy: Policy, batch: int, generator: torch.Generator | None, noise: Tensor | None
 ) -> tuple[Tensor, ...]:

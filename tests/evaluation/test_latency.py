@@ -2,14 +2,18 @@
 
 import time
 
+import numpy as np
 import pytest
 import torch
 from point_mass import SPEC, Proportional
 
+from manicm_ms.demos.stats import field_stats
 from manicm_ms.errors import ConfigError
 from manicm_ms.evaluation.latency import measure_latency
 from manicm_ms.machine.devices import torch_threads
 from manicm_ms.policies import example_observations
+from manicm_ms.policies.methods import make_policy
+from manicm_ms.policies.policy import typical_observations
 
 
 class Busy(Proportional):
@@ -85,3 +89,18 @@ def test_example_observations_are_of_what_the_policy_reads():
 def test_senseless_counts_are_refused():
     with pytest.raises(ConfigError, match="repetitions=0"):
         measure_latency({"a": Proportional()}, repetitions=0)
+
+
+def test_decisions_are_timed_on_observations_within_what_was_learnt():
+    """A hair's breadth of training data: numbers from 0 to 1 would lie a thousand ranges away, and blow networks up."""
+    policy = make_policy("pocket_dp3", SPEC, size="smoke", seed=0)
+    rng = np.random.default_rng(0)
+    channels = {"point_cloud": 3, "agent_pos": SPEC.obs.agent_pos_dim, "action": SPEC.action.dim}
+    data = {key: rng.uniform(0.5, 0.501, (8, n)).astype(np.float32) for key, n in channels.items()}
+    policy.fit_normalizer({key: field_stats(values, key) for key, values in data.items()})
+    obs = typical_observations(policy, 4)
+    for key, value in obs.items():
+        assert policy.normalizer.normalize(key, value).abs().max() <= 1 + 1e-3
+        assert value.std() > 0
+    assert policy.normalizer.normalize("point_cloud", example_observations(policy)["point_cloud"]).abs().max() > 100
+    assert measure_latency({"pocket": policy}, repetitions=1, warmup=0)["pocket"].nfe == 2
