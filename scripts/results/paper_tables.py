@@ -136,7 +136,7 @@ def joined(parts: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
 def real_world() -> Any:
     """Return the script of the real-world table, which lies beside this one."""
     if str(REPO / "scripts") not in sys.path:
-        sys.path.insert(0, str(REPO / "scripts"))
+        sys.path.append(str(REPO / "scripts"))  # last: former paths of other scripts lie there
     import reproduce_real_world_table
 
     return reproduce_real_world_table

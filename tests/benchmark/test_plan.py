@@ -4,6 +4,7 @@ from dataclasses import replace
 from pathlib import Path
 
 import pytest
+import torch
 
 from manicm_ms.benchmark.jobs import CollectJob, all_jobs
 from manicm_ms.benchmark.methods import OneStep, Steps, Student, Trained, parse_methods
@@ -11,6 +12,8 @@ from manicm_ms.benchmark.plan import Plan, parse_envs, parse_seeds
 from manicm_ms.demos.store import DemoStore
 from manicm_ms.envs.simulator import ENVS
 from manicm_ms.errors import ConfigError, UnknownNameError
+from manicm_ms.policies.checkpoint import save_checkpoint
+from manicm_ms.policies.methods import make_policy
 
 
 def plan(**changes):
@@ -47,6 +50,15 @@ def test_a_number_behind_a_name_is_that_of_network_evaluations():
     ]  # fmt: skip
     assert parse_methods(["meanflow_4"]) == (Steps("meanflow_4", Trained("meanflow"), 4),)
     assert [m.owner.name for m in (four, student, of_dp3)] == ["simple_dp3", "manicm", "manicm:dp3"]
+
+
+def test_such_a_method_plays_with_the_checkpoint_of_the_method_itself(tmp_path):
+    spec = ENVS.get("adroit/door").spec
+    save_checkpoint(make_policy("simple_dp3", spec, size="smoke", seed=0), tmp_path / "teacher", {})
+    four, whole = (m.load(tmp_path / "teacher", "cpu") for m in parse_methods(["simple_dp3_4", "simple_dp3"]))
+    assert (four.nfe, whole.nfe) == (4, 10)
+    own = dict(whole.head.backbone.named_parameters())
+    assert all(torch.equal(p, own[name]) for name, p in four.head.backbone.named_parameters())
 
 
 @pytest.mark.parametrize(
